@@ -88,7 +88,10 @@ class TestExplanations:
             ("error: command 'x86_64-linux-gnu-gcc' failed: No such file", "no C compiler"),
             ("error: command 'gcc' failed with exit code 1", "no C compiler"),
             ("fatal error: Python.h: No such file or directory", "no C compiler"),
-            ("ERROR: No matching distribution found for rclpy", "does not exist for this Python"),
+            ("ERROR: No matching distribution found for uv", "does not exist for this Python"),
+            ("No solution found\n  cause: Because a was not found", "(a was not found): run"),
+            ("client error (Connect)\n  cause: dns error", "export HTTPS_PROXY="),
+            ("invalid peer certificate: UnknownIssuer", "export PIP_CERT="),
             ("PermissionError: [Errno 13] Permission denied: 'x'", "sudo chown"),
         ],
     )
@@ -192,45 +195,6 @@ def test_the_modules_are_compiled_whatever_python_may_write_by_itself(
     assert (tree / "neuros" / "__pycache__" / cache).exists()
 
 
-class TestStamp:
-    """What an earlier run left says whether there is anything to do."""
-
-    @pytest.fixture
-    def stamped(self, tree: Path) -> Path:
-        environment = environment_of(tree, "mujoco", "nest")
-        environment.folder.mkdir()
-        environment.write_stamp()
-        return tree
-
-    def test_without_a_virtual_environment_nothing_is_installed(self, tree: Path) -> None:
-        assert not environment_of(tree, "nest").is_installed
-
-    @pytest.mark.parametrize("extras", [("mujoco", "nest"), ("nest", "mujoco"), ("nest",), ()])
-    def test_the_same_or_less_is_installed(self, stamped: Path, extras: tuple[str, ...]) -> None:
-        assert environment_of(stamped, *extras).is_installed
-
-    def test_a_further_extra_is_not_installed(self, stamped: Path) -> None:
-        assert not environment_of(stamped, "nest", "dev").is_installed
-
-    def test_other_dependencies_are_not_installed(self, stamped: Path) -> None:
-        (stamped / "pyproject.toml").write_text(PYPROJECT + "# changed", "utf-8")
-        assert not environment_of(stamped, "nest").is_installed
-
-    def test_other_lock_files_are_not_installed(self, stamped: Path) -> None:
-        (stamped / "requirements").mkdir()
-        (stamped / "requirements" / "core.txt").write_text("numpy==2.0.0\n", "utf-8")
-        assert not environment_of(stamped, "nest").is_installed
-
-    def test_the_newest_packages_are_looked_for_each_time(self, stamped: Path) -> None:
-        environment = Environment(stamped, ["nest"], Progress(StringIO()), newest=True)
-        assert not environment.is_installed
-
-    @pytest.mark.parametrize("text", ["", "[]", "{}", '{"extras": 3}', "null"])
-    def test_a_broken_stamp_counts_for_nothing(self, stamped: Path, text: str) -> None:
-        (stamped / ".venv" / "neuros.json").write_text(text, "utf-8")
-        assert not environment_of(stamped, "nest").is_installed
-
-
 @pytest.fixture(scope="module")
 def pattern(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A virtual environment with nothing in it but pip."""
@@ -253,10 +217,10 @@ class TestVirtualEnvironment:
         assert environment_of(tree).python_version() is None
 
     def test_one_that_was_interrupted_is_not(self, pattern: Path) -> None:
-        log = pattern / "neuros-install.log"
-        log.touch()
+        unfinished = pattern / "neuros-unfinished"
+        unfinished.touch()
         assert environment_of(pattern.parent).python_version() is None
-        log.unlink()
+        unfinished.unlink()
 
     def test_one_whose_python_is_gone_is_not(self, tree: Path) -> None:
         venv.create(tree / ".venv", with_pip=False)

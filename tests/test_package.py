@@ -24,7 +24,7 @@ from viewers.dashboard.visitor import address
 
 from neuros.backends.pythons import find_python
 from neuros.installation.machine import NEWEST_FOR_NEST, clean_environment
-from neuros.installation.packages import Installer, find_uv
+from neuros.installation.packages import Installer
 from neuros.installation.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -226,12 +226,9 @@ def test_three_commands_lead_to_a_robot_that_moves(
     environ.pop("VIRTUAL_ENV", None)
     run(python, "-m", "venv", tmp_path / "venv", cwd=tmp_path, environ=environ)
     environ["PATH"] = f"{tmp_path / 'venv' / 'bin'}{os.pathsep}{environ['PATH']}"
-    made, wanted = tmp_path / "venv", [[f"{wheel}[mujoco,nest,plot]"]]
-    progress = Progress(sys.stdout)
-    uv = find_uv(Path(sys.executable), environ)
-    log = tmp_path / "log"
-    installer = Installer(made / "bin" / "python", made, log, progress, environ)
-    assert installer.install(wanted, uv) is None
+    made, progress = tmp_path / "venv", Progress(sys.stdout)
+    installer = Installer(made / "bin" / "python", made, tmp_path / "log", progress, environ)
+    installer.install([f"{wheel}[mujoco,nest,plot]"])
     run("neuros", "example", "whiskeye", cwd=tmp_path, environ=environ)
     see_a_robot_that_turns(
         tmp_path / "whiskeye", environ, SCREENSHOTS / ".".join(map(str, version))

@@ -1,4 +1,4 @@
-"""Packages are installed with uv or pip, as the lock files say, which fit ``pyproject.toml``."""
+"""Packages are installed with uv, as the lock files say, which fit ``pyproject.toml``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import shutil
 import sys
 import threading
 import venv
+import zipfile
 from collections.abc import Iterator
 from functools import cache, partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -26,10 +27,12 @@ from neuros.installation.machine import NEWEST, OLDEST, clean_environment, dotte
 from neuros.installation.packages import (
     LOCKS,
     UV,
+    InstallationFailed,
     Installer,
     explain_failure,
     find_uv,
     install,
+    make_venv,
     uv_settings,
 )
 from neuros.installation.progress import Progress
@@ -115,6 +118,13 @@ class TestLockFiles:
         assert rest == "# .ci/lock wrote this file: do not edit it.\n"
 
 
+def settings_of(listing: str, environ: dict[str, str]) -> dict[str, str]:
+    """The settings that uv gets, where it has all."""
+    settings, unknown = uv_settings(listing, environ)
+    assert unknown == []
+    return settings
+
+
 class TestSettingsOfPip:
     """uv gets what pip is told; it reads none of it by itself."""
 
@@ -126,7 +136,7 @@ class TestSettingsOfPip:
             ":env:.proxy='http://proxy:3128'\n"
             "install.trusted-host='mirror'\n"
         )
-        assert uv_settings(listing, {"SSL_CERT_FILE": "/other.pem"}) == {
+        assert settings_of(listing, {"SSL_CERT_FILE": "/other.pem"}) == {
             "UV_DEFAULT_INDEX": "https://mirror/simple",
             "UV_INDEX": "https://one/simple\nhttps://two/simple",
             "SSL_CERT_FILE": "/my.pem",
@@ -138,33 +148,32 @@ class TestSettingsOfPip:
 
     def test_a_variable_comes_before_a_file(self) -> None:
         listing = ":env:.index-url='https://b'\nglobal.index-url='https://a'\n"
-        settings = uv_settings(listing, {"SSL_CERT_FILE": "/my.pem"})
+        settings = settings_of(listing, {"SSL_CERT_FILE": "/my.pem"})
         assert settings == {"UV_DEFAULT_INDEX": "https://b"}
 
     def test_what_the_user_tells_uv_itself_stays(self) -> None:
         environ = {"UV_DEFAULT_INDEX": "https://mine", "SSL_CERT_FILE": "/my.pem"}
-        assert uv_settings("global.index-url='https://a'\n", environ) == {}
+        assert settings_of("global.index-url='https://a'\n", environ) == {}
 
     def test_folders_of_wheels_that_are_not_there_are_left_out(self, tmp_path: Path) -> None:
         listing = f"global.find-links='{tmp_path} {tmp_path}/nowhere https://wheels'\n"
-        settings = uv_settings(listing, {"SSL_CERT_FILE": "/my.pem"})
+        settings = settings_of(listing, {"SSL_CERT_FILE": "/my.pem"})
         assert settings == {"UV_FIND_LINKS": f"{tmp_path},https://wheels"}
 
     @pytest.mark.parametrize(("value", "is_set"), [("1", True), ("true", True), ("0", False)])
     def test_an_index_is_used_unless_it_is_forbidden(self, value: str, is_set: bool) -> None:
-        settings = uv_settings(f":env:.no-index='{value}'\n", {})
-        assert settings is not None
+        settings = settings_of(f":env:.no-index='{value}'\n", {})
         assert ("UV_NO_INDEX" in settings) == is_set
 
     @pytest.mark.parametrize("name", ["REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE"])
     def test_certificates_for_requests_are_for_uv_too(self, name: str) -> None:
-        assert uv_settings("", {name: "/my.pem"}) == {"SSL_CERT_FILE": "/my.pem"}
+        assert settings_of("", {name: "/my.pem"}) == {"SSL_CERT_FILE": "/my.pem"}
 
-    def test_a_setting_that_uv_has_not_leaves_it_to_pip(self) -> None:
-        assert uv_settings("global.keyring-provider='import'\n", {}) is None
+    def test_settings_that_uv_has_not_are_named(self) -> None:
+        assert uv_settings("global.keyring-provider='import'\n", {})[1] == ["keyring-provider"]
 
     def test_settings_of_the_output_do_not_matter(self) -> None:
-        assert uv_settings("global.quiet='1'\n", {"SSL_CERT_FILE": "/my.pem"}) == {}
+        assert settings_of("global.quiet='1'\n", {"SSL_CERT_FILE": "/my.pem"}) == {}
 
 
 def program(path: Path, text: str) -> Path:
@@ -177,20 +186,29 @@ def program(path: Path, text: str) -> Path:
 class TestUv:
     def test_the_one_beside_python_comes_first(self, tmp_path: Path) -> None:
         beside = program(tmp_path / "bin" / "uv", "")
-        program(tmp_path / "path" / "uv", "echo uv 0.9.1")
-        environ = {"PATH": str(tmp_path / "path")}
-        assert find_uv(tmp_path / "bin" / "python", environ) == beside
+        assert find_uv(tmp_path / "bin" / "python") == beside
 
-    @pytest.mark.parametrize(
-        ("answer", "is_used"),
-        [("uv 0.9.0", True), ("uv 1.0.0 (x)", True), ("uv 0.1.39", False), ("nonsense", False)],
-    )
-    def test_one_on_the_path_has_to_be_new_enough(
-        self, answer: str, is_used: bool, tmp_path: Path
-    ) -> None:
-        on_path = program(tmp_path / "uv", f"echo '{answer}'")
-        found = find_uv(tmp_path / "bin" / "python", {"PATH": str(tmp_path)})
-        assert found == (on_path if is_used else None)
+    def test_else_the_one_of_this_python_is_used(self, tmp_path: Path) -> None:
+        assert find_uv(tmp_path / "bin" / "python") == Path(sys.executable).with_name("uv")
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("echo No module named venv >&2; exit 1", "has no venv: "),
+        ("echo first; echo last; exit 1", "last"),
+        (
+            "echo '[Errno 28] No space left on device'; exit 1",
+            "the disk is full: make room (df -h)",
+        ),
+    ],
+)
+def test_why_there_is_no_virtual_environment_is_said(text: str, why: str, tmp_path: Path) -> None:
+    python = program(tmp_path / "python3.12", text)
+    said = make_venv([str(python), "-m", "venv", "x"], os.environ)
+    assert why in said
+    assert ("python3.12-venv" in said) == ("has no venv" in why)
+    assert make_venv([str(tmp_path / "none")], os.environ).endswith("/none cannot be started")
 
 
 @pytest.fixture
@@ -223,111 +241,104 @@ def empty(python: Path) -> None:
     folder = python.parent.parent
     python.with_name("uv").unlink(missing_ok=True)
     (folder / "log").unlink(missing_ok=True)
-    for path in folder.glob("lib/*/site-packages/neuros*"):
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for name in ("neuros*", "uv*"):
+        for path in folder.glob(f"lib/*/site-packages/{name}"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
-class TestFallback:
-    """What cannot be had with uv, pip installs; here from a folder, without a network."""
+@pytest.fixture
+def python(with_pip: Path) -> Iterator[Path]:
+    yield with_pip
+    empty(with_pip)
 
-    @pytest.fixture
-    def python(self, with_pip: Path, tmp_path: Path) -> Iterator[Path]:
-        make_wheel(tmp_path / "wheels", "neuros_colour", "1.0", "NAME = 'red'")
-        yield with_pip
-        empty(with_pip)
 
-    def run(self, python: Path, uv: Path | None, environ: dict[str, str]) -> tuple[str | None, str]:
+def is_installed(python: Path) -> bool:
+    return bool([*python.parents[1].glob("lib/*/site-packages/neuros_colour.py")])
+
+
+class TestInstaller:
+    """From a folder of wheels, without a network."""
+
+    def run(self, python: Path, environ: dict[str, str]) -> str:
+        """Install; returns what was shown."""
         stream, folder = StringIO(), python.parent.parent
+        make_wheel(Path(environ["PIP_FIND_LINKS"]), "neuros_colour", "1.0", "NAME = 'red'")
         installer = Installer(python, folder, folder / "log", Progress(stream), environ)
-        output = installer.install([["neuros_colour"]], uv)
-        return output, stream.getvalue()
+        installer.install(["neuros_colour"])
+        return stream.getvalue()
 
-    def is_installed(self, python: Path) -> bool:
-        return bool([*python.parent.parent.glob("lib/*/site-packages/neuros_colour.py")])
-
-    def test_what_fails_with_uv_pip_tries(self, python: Path, environ: dict[str, str]) -> None:
-        uv = program(python.with_name("uv"), "echo the proxy stops uv; exit 2")
-        output, shown = self.run(python, uv, environ)
-        assert output is None
-        assert "uv failed: trying pip (log: " in shown
-        assert self.is_installed(python)
-        assert "the proxy stops uv" in (python.parent.parent / "log").read_text("utf-8")
-
-    def test_a_full_disk_is_one_for_pip_as_well(
-        self, python: Path, environ: dict[str, str]
-    ) -> None:
-        uv = program(python.with_name("uv"), "echo 'No space left on device (os error 28)'; exit 2")
-        output, _ = self.run(python, uv, environ)
-        assert explain_failure(output or "") == "the disk is full: make room (df -h)"
-        assert not self.is_installed(python)
+    def test_what_uv_says_is_the_error(self, python: Path, environ: dict[str, str]) -> None:
+        program(python.with_name("uv"), "echo No space left on device; exit 2")
+        with pytest.raises(InstallationFailed, match="No space left on device"):
+            self.run(python, environ)
+        assert not is_installed(python)
+        assert "No space left" in (python.parent.parent / "log").read_text("utf-8")
 
     def test_uv_gets_the_settings_of_pip(self, python: Path, environ: dict[str, str]) -> None:
-        uv = program(python.with_name("uv"), 'echo "$@" "[$UV_NO_INDEX $UV_FIND_LINKS]"')
-        output, shown = self.run(python, uv, environ)
-        assert output is None
+        program(python.with_name("uv"), 'echo "$@" "[$UV_NO_INDEX $UV_FIND_LINKS]"')
+        assert "uv has no setting" not in self.run(python, environ)
         log = (python.parent.parent / "log").read_text("utf-8")
         assert f"--python {python} neuros_colour [1 {environ['PIP_FIND_LINKS']}]" in log
-        assert "pip" not in shown
 
     @pytest.mark.parametrize(("set_to", "is_told"), [(None, "1"), ("0", "0")])
     def test_modules_are_compiled_unless_the_user_tells_uv_not_to(
         self, python: Path, environ: dict[str, str], set_to: str | None, is_told: str
     ) -> None:
-        uv = program(python.with_name("uv"), 'echo "[$UV_COMPILE_BYTECODE]"')
-        self.run(python, uv, environ | ({"UV_COMPILE_BYTECODE": set_to} if set_to else {}))
+        program(python.with_name("uv"), 'echo "[$UV_COMPILE_BYTECODE]"')
+        self.run(python, environ | ({"UV_COMPILE_BYTECODE": set_to} if set_to else {}))
         assert f"[{is_told}]" in (python.parent.parent / "log").read_text("utf-8")
 
-    def test_a_setting_that_uv_does_not_know_is_said(
+    def test_a_setting_that_uv_has_not_is_named(
         self, python: Path, environ: dict[str, str]
     ) -> None:
-        uv = program(python.with_name("uv"), "exit 2")
-        output, shown = self.run(python, uv, {**environ, "PIP_PRE": "1"})
-        assert output is None
-        assert "uv does not know all settings that pip has here: using pip" in shown
-        assert self.is_installed(python)
+        shown = self.run(python, {**environ, "PIP_PRE": "1"})
+        assert "uv has no setting like pip's pre, and goes without" in shown
+        assert is_installed(python)
 
-    def test_where_there_is_no_uv_install_says_so_and_takes_pip(
-        self, python: Path, environ: dict[str, str], tmp_path: Path
+    def test_where_there_is_no_uv_pip_installs_it(
+        self, python: Path, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """From a folder of wheels, and without lock files, which such a folder need not match."""
-        tree, stream = tmp_path / "tree", StringIO()
-        tree.mkdir()
-        (tree / "pyproject.toml").write_text(
-            '[build-system]\nrequires = []\nbuild-backend = "backend"\nbackend-path = ["."]\n'
-        )
-        (tree / "backend.py").write_text(
-            "import shutil, pathlib\n"
-            "def build_editable(target, config_settings=None, metadata_directory=None):\n"
-            f"    wheel = next(pathlib.Path({str(tmp_path / 'wheels')!r}).glob('*.whl'))\n"
-            "    shutil.copy(wheel, target)\n"
-            "    return wheel.name\n"
-        )
-        install(python, tree, ["plot"], Progress(stream), environ)
-        assert "there is no uv for this machine: using pip, which takes longer" in (
-            stream.getvalue()
-        )
-        assert self.is_installed(python)
+        monkeypatch.setattr(sys, "executable", "/nowhere/python")
+        wheels = Path(environ["PIP_FIND_LINKS"])
+        wheels.mkdir()
+        with zipfile.ZipFile(wheels / "uv-0.9.1-py3-none-any.whl", "w") as wheel:
+            info = "Metadata-Version: 2.1\nName: uv\nVersion: 0.9.1\n"
+            wheel.writestr("uv-0.9.1.dist-info/METADATA", info)
+            kind = "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+            wheel.writestr("uv-0.9.1.dist-info/WHEEL", kind)
+            script = zipfile.ZipInfo("uv-0.9.1.data/scripts/uv")
+            script.external_attr = 0o100755 << 16
+            wheel.writestr(script, "#!/bin/sh\necho this uv\n")
+            rows = "uv-0.9.1.dist-info/METADATA,,\nuv-0.9.1.dist-info/WHEEL,,\n"
+            wheel.writestr("uv-0.9.1.dist-info/RECORD", rows)
+        self.run(python, environ)
+        assert "this uv" in (python.parent.parent / "log").read_text("utf-8")
 
-    def test_without_a_network_nothing_is_tried_after_uv(
-        self, python: Path, environ: dict[str, str]
+    def test_a_folder_of_wheels_without_uv_is_said_to_lack_it(
+        self, python: Path, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        monkeypatch.setattr(sys, "executable", "/nowhere/python")
+        with pytest.raises(EnvironmentFault, match=r"No matching distribution found for uv.*house"):
+            install(python, ROOT, ["plot"], Progress(StringIO()), environ)
+
+    @pytest.mark.parametrize("has_uv", [True, False])
+    def test_an_index_that_cannot_be_reached_is_said(
+        self,
+        python: Path,
+        environ: dict[str, str],
+        monkeypatch: pytest.MonkeyPatch,
+        has_uv: bool,
+    ) -> None:
+        if not has_uv:
+            monkeypatch.setattr(sys, "executable", "/nowhere/python")
         online = {k: v for k, v in environ.items() if k not in ("PIP_NO_INDEX", "PIP_FIND_LINKS")}
-        online |= {"PIP_INDEX_URL": "http://127.0.0.1:9/", "PIP_RETRIES": "1"}
-        stream = StringIO()
+        online |= {"PIP_INDEX_URL": "http://127.0.0.1:9/", "PIP_RETRIES": "1", "UV_NO_CACHE": "1"}
         with pytest.raises(EnvironmentFault, match=r"^the package index .* cannot be reached"):
-            install(python, ROOT, ["plot"], Progress(stream), online)
-        assert "using pip" not in stream.getvalue()
+            install(python, ROOT, ["plot"], Progress(StringIO()), online)
 
 
 class TestHashes:
-    """A file is installed only if a lock file names its hash, by uv and by pip."""
-
-    @pytest.fixture(params=["uv", "pip"])
-    def python(self, request: pytest.FixtureRequest, with_pip: Path) -> Iterator[Path]:
-        if request.param == "uv":
-            with_pip.with_name("uv").symlink_to(Path(sys.executable).with_name("uv"))
-        yield with_pip
-        empty(with_pip)
+    """A file is installed only if a lock file names its hash."""
 
     @pytest.fixture
     def index(self, tmp_path: Path) -> Iterator[dict[str, str]]:
@@ -368,9 +379,6 @@ class TestHashes:
         install(python, tree, [], Progress(stream), index)
         return stream.getvalue()
 
-    def is_installed(self, python: Path) -> bool:
-        return bool([*python.parents[1].glob("lib/*/site-packages/neuros_colour.py")])
-
     def sha256(self, tmp_path: Path) -> str:
         wheel = next(tmp_path.rglob("neuros_colour*.whl"))
         return hashlib.sha256(wheel.read_bytes()).hexdigest()
@@ -379,7 +387,7 @@ class TestHashes:
         self, python: Path, index: dict[str, str], tmp_path: Path
     ) -> None:
         self.install(python, f" --hash=sha256:{self.sha256(tmp_path)}", index, tmp_path)
-        assert self.is_installed(python)
+        assert is_installed(python)
 
     def test_constraints_of_pip_need_no_hash(
         self, python: Path, index: dict[str, str], tmp_path: Path
@@ -389,8 +397,8 @@ class TestHashes:
         constraints.write_text("neuros-shape<=2\n", "utf-8")
         constrained = {**index, "PIP_CONSTRAINT": str(constraints)}
         hashes = f" --hash=sha256:{self.sha256(tmp_path)}"
-        assert "uv failed" not in self.install(python, hashes, constrained, tmp_path)
-        assert self.is_installed(python)
+        self.install(python, hashes, constrained, tmp_path)
+        assert is_installed(python)
 
     def test_a_file_that_has_changed_since_is_refused(
         self, python: Path, index: dict[str, str], tmp_path: Path
@@ -399,14 +407,14 @@ class TestHashes:
         make_wheel(tmp_path / "simple/neuros-colour", "neuros_colour", "1.0", "CHANGED = True")
         with pytest.raises(EnvironmentFault, match=r"is not the one that the lock file names"):
             self.install(python, f" --hash=sha256:{before}", index, tmp_path)
-        assert not self.is_installed(python)
+        assert not is_installed(python)
 
     def test_a_package_without_a_hash_is_refused(
         self, python: Path, index: dict[str, str], tmp_path: Path
     ) -> None:
         with pytest.raises(EnvironmentFault):
             self.install(python, "", index, tmp_path)
-        assert not self.is_installed(python)
+        assert not is_installed(python)
 
 
 class QuietHandler(SimpleHTTPRequestHandler):

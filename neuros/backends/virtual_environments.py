@@ -10,7 +10,7 @@ On another version of Python it has everything, ROS 2 included.
         <container>-<key>/            a virtual environment
         <container>-<key>.json        says that it is whole, and which Python to run
         <container>-<key>.lock        only while somebody makes it
-        <container>-<key>.log         what pip wrote
+        <container>-<key>.log         what uv wrote
 
 The ``.json`` is written last, in one step: what was interrupted never looks whole. There are some
 without a folder: they remember that the launcher's own environment does, which saves the next
@@ -30,7 +30,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,8 +41,14 @@ from neuros.backends.containers import ContainerFolder
 from neuros.caching import UNUSED_S, Kept, cache_root, kept_in
 from neuros.distribution import PACKAGE, install_command
 from neuros.errors import EnvironmentFault
-from neuros.installation.machine import clean_environment, dotted, system_install
-from neuros.installation.packages import Installer, explain_machine, find_uv
+from neuros.installation.machine import clean_environment, dotted
+from neuros.installation.packages import (
+    InstallationFailed,
+    Installer,
+    explain_machine,
+    make_venv,
+    why_unsatisfiable,
+)
 from neuros.installation.progress import Progress
 
 if TYPE_CHECKING:
@@ -51,11 +56,9 @@ if TYPE_CHECKING:
 
 Version = tuple[int, int]
 HERE: Version = sys.version_info[:2]
-_FULL_BYTES = 0.6e9  # ROS 2, and pip's copies while it works
+_FULL_BYTES = 0.6e9  # ROS 2, and uv's copies while it works
 _BOOTSTRAPPER = "ros_wheels_bootstrapper"
-_NONE = re.compile(r"satisfies the requirement (.+?) \(from versions: (.*)\)")
-_CONFLICT = re.compile(r"The conflict is caused by:\n((?: {4}.+\n)+)")
-_FEW = 5
+_PLANNED = re.compile(r"^ \+ (.+)$", re.MULTILINE)
 
 
 def cache_folder(environ: Mapping[str, str]) -> Path:
@@ -65,7 +68,7 @@ def cache_folder(environ: Mapping[str, str]) -> Path:
 
 @dataclass(frozen=True)
 class Entry(Kept):
-    """One environment, made or not; the log has what pip wrote."""
+    """One environment, made or not; the log has what uv wrote."""
 
     @property
     def stamp(self) -> Path:
@@ -237,17 +240,9 @@ def _make_venv(choice: Choice, progress: Progress, run_environment: Mapping[str,
         )
     # A layer finds pip where it finds the rest.
     options = ["--without-pip"] if choice.is_layered and _is_here("pip") else []
-    made = subprocess.run(
-        [str(choice.base), "-m", "venv", *options, str(folder)],
-        env={**clean_environment(os.environ), **run_environment},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if made.returncode:
-        output = (made.stdout + made.stderr).strip()
-        raise _fault(choice, why_no_venv(output, dotted(choice.version)))
+    command = [str(choice.base), "-m", "venv", *options, str(folder)]
+    if why := make_venv(command, {**os.environ, **run_environment}):
+        raise _fault(choice, why)
 
 
 def _add_links(choice: Choice) -> None:
@@ -282,25 +277,30 @@ def _is_here(package: str) -> bool:
 
 
 def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    entry, needs = choice.entry, own_needs()
-    wanted = ["--requirement", str(choice.requirements.file)]
-    # With hashes, pip refuses what has none: then what NeuROS needs comes first, by itself.
-    calls = [[*wanted, *needs]]
-    if choice.requirements.has_hashes:
-        calls = [needs, ["--require-hashes", *wanted]]
+    entry, needs, file = choice.entry, own_needs(), choice.requirements.file
     if not needs:
         cause = f"neuros itself is not installed for {sys.executable}: {install_command()}"
         raise _fault(choice, cause)
-    progress.step(f"installing {choice.requirements.file} (log: {entry.log})")
+    progress.step(f"installing {file} (log: {entry.log})")
     environ = {**clean_environment(os.environ), **run_environment}
-    # uv does not see what a layer finds in this environment, and would install all of it again.
-    uv = None if choice.is_layered else find_uv(Path(sys.executable), environ)
     entry.log.unlink(missing_ok=True)
     installer = Installer(entry.future_python, entry.folder, entry.log, progress, environ)
-    output = installer.install(calls, uv)
-    if output is not None:
-        cause = why_pip_failed(output, dotted(choice.version), needs)
-        raise _fault(choice, f"{cause} (log: {entry.log})")
+    wanted = ["--requirement", str(file)]
+    try:
+        if choice.requirements.has_hashes:
+            # uv refuses what has no hash: what NeuROS needs comes first, by itself.
+            if not choice.is_layered:
+                installer.install(needs)
+            wanted, needs = ["--require-hashes", *wanted], []
+        elif choice.is_layered:
+            # uv sees no packages of this environment in the layer: it plans for this environment.
+            plan = ["--dry-run", "--break-system-packages", *wanted, *needs]
+            planned = _PLANNED.findall(installer.install(plan, Path(sys.executable)))
+            wanted, needs = ["--no-deps", *planned, *choice.requirements.editable], []
+        installer.install([*wanted, *needs])
+    except InstallationFailed as failure:
+        cause = why_uv_failed(failure.output, dotted(choice.version), needs)
+        raise _fault(choice, f"{cause} (log: {entry.log})") from failure
 
 
 def _words(choice: Choice) -> str:
@@ -315,30 +315,18 @@ def _fault(choice: Choice, cause: str) -> EnvironmentFault:
     )
 
 
-def why_pip_failed(output: str, python: str, own_needs: Sequence[str]) -> str:
-    """The cause in the output of pip, for a version of Python as ``3.12``.
+def why_uv_failed(output: str, python: str, own_needs: Sequence[str]) -> str:
+    """The cause in the output of uv, for a version of Python as ``3.12``.
 
-    ``own_needs`` are the requirements of NeuROS itself that pip was given, too.
+    ``own_needs`` are the requirements of NeuROS itself that uv was given, too.
     """
     if sentence := explain_machine(output, again="launch"):
         return sentence
-    if none := _NONE.search(output):
-        return f"no {none[1]} exists for Python {python} ({_there_is(none[2].split(', '))})"
-    if conflict := _CONFLICT.search(output):
-        rows = "; ".join(row.strip() for row in conflict[1].splitlines())
-        own = [need for need in own_needs if re.search(rf"\b{_name_of(need)}\b", rows)]
-        return f"these exclude each other: {rows}" + "".join(f"; NeuROS needs {n}" for n in own)
-    errors = re.findall(r"^ERROR: (.+)", output, re.MULTILINE)
-    return errors[0] if errors else "pip failed"
-
-
-def why_no_venv(output: str, python: str) -> str:
-    """The cause in the output of ``venv``."""
-    if re.search(r"ensurepip|No module named '?venv", output):
-        remedy = system_install(apt=f"python{python}-venv", dnf="python3-pip")
-        return f"Python {python} has no venv: {remedy}"
-    rows = output.splitlines() or ["venv failed"]
-    return explain_machine(output) or rows[-1]
+    if cause := why_unsatisfiable(output):
+        own = [need for need in own_needs if re.search(rf"\b{_name_of(need)}\b", cause)]
+        return f"{cause} (for Python {python})" + "".join(f"; NeuROS needs {n}" for n in own)
+    errors = re.findall(r"^(?:error|  cause): (.+)", output, re.MULTILINE)
+    return ": ".join(errors) or "uv failed"
 
 
 def why_no_files(error: OSError, cache: Path) -> str:
@@ -348,13 +336,6 @@ def why_no_files(error: OSError, cache: Path) -> str:
     return f"{error.filename or cache}: {error.strerror}: set XDG_CACHE_HOME to another folder"
 
 
-def _there_is(versions: Sequence[str]) -> str:
-    if list(versions) == ["none"]:
-        return "pip finds no package of that name"
-    more = "..., " if len(versions) > _FEW else ""
-    return f"there is {more}{', '.join(versions[-_FEW:])}"
-
-
 def _name_of(requirement: str) -> str:
     match = re.match(r"[\w.-]+", requirement)
     return re.escape(match[0]) if match else ""
@@ -362,6 +343,7 @@ def _name_of(requirement: str) -> str:
 
 _COMMENT = re.compile(r"(^|\s+)#.*$")
 _INCLUDE = re.compile(r"(-r|-c|--requirement|--constraint)(?:\s+|=|(?<=-[rc]))(?P<file>\S.*)")
+_EDITABLE = re.compile(r"(?:-e|--editable)(?:\s+|=|(?<=-e))(\S.*)")
 _OPTION = re.compile(r"\s--?\w.*$")
 
 
@@ -391,8 +373,14 @@ class Requirements:
 
     @property
     def has_hashes(self) -> bool:
-        """Whether pip refuses packages without a hash."""
+        """Whether uv refuses packages without a hash."""
         return any("--hash" in line.text for line in self.lines)
+
+    @property
+    def editable(self) -> list[str]:
+        """The arguments that install what is to stay editable."""
+        rows = [_EDITABLE.fullmatch(line.text) for line in self.lines]
+        return [argument for row in rows if row for argument in ("--editable", row[1])]
 
 
 def read_requirements(file: Path) -> Requirements:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import hashlib
-import json
 import os
 import platform
 import re
@@ -28,9 +26,14 @@ from neuros.installation.machine import (
     explain_missing_library,
     install_opengl,
     offscreen_opengl,
-    system_install,
 )
-from neuros.installation.packages import LOCKS, LOG, explain_failure, install, pip_settings
+from neuros.installation.packages import (
+    LOCKS,
+    explain_failure,
+    install,
+    make_venv,
+    pip_settings,
+)
 from neuros.installation.progress import Progress
 
 STANDARD_EXTRAS = ("mujoco", "nest", "plot")
@@ -51,7 +54,7 @@ def main(arguments: Sequence[str], root: str) -> int:
         environment = Environment(
             folder, options.extras, progress, pip_settings(options), newest=options.newest
         )
-        if not (options.yes or environment.is_installed or _agrees(environment.folder)):
+        if not (options.yes or environment.python_version() or _agrees(environment.folder)):
             return 130
         if options.test:
             prepare_tests(folder)
@@ -293,25 +296,13 @@ class Environment:
         self.folder, self.extras = root / ".venv", tuple(extras)
         self._root, self._progress = root, progress
         self._pip_settings, self._newest = pip_settings, newest
-        self._stamp = self.folder / "neuros.json"
-        self._is_filled = False
+        # There while something is installed: half a package would be taken for whole.
+        self._unfinished = self.folder / "neuros-unfinished"
 
     @property
     def python(self) -> Path:
         """The Python in it."""
         return self.folder / "bin" / "python"
-
-    @property
-    def is_installed(self) -> bool:
-        """Whether an earlier run installed all this, and the lock files are the same."""
-        if self._newest and not self._is_filled:
-            return False
-        try:
-            stamp = json.loads(self._stamp.read_text("utf-8"))
-            extras = set(stamp["extras"])
-            return extras >= {*self.extras} and stamp == self._stamp_for(sorted(extras))
-        except (OSError, ValueError, LookupError, TypeError):
-            return False
 
     def install(self) -> None:
         """Install what is missing and prove that it works.
@@ -325,19 +316,17 @@ class Environment:
         version = self.python_version()
         is_new = version is None
         self._leave_out_nest(version or self._make())
-        if is_new or not self.is_installed:
-            self._fill()
+        self._fill()
         faults = self._prove()
         if faults and not is_new:
-            # Files may be missing that pip believes to be there: an interrupted run, a full disk.
+            # Files may be missing that uv believes to be there.
             self._progress.step(f"{faults[0]}; beginning anew")
             self._make()
             self._fill()
             faults = self._prove()
         if faults:
             raise EnvironmentFault(explain_missing_library("; ".join(faults)))
-        if not self.is_installed:
-            self.write_stamp()
+        self._unfinished.unlink()
         self.compile()
 
     def compile(self) -> None:
@@ -348,21 +337,10 @@ class Environment:
         command = [str(self.python), "-m", "compileall", "-qq", str(self._root / "neuros")]
         subprocess.run(command, env=clean_environment(os.environ), check=False)
 
-    def write_stamp(self) -> None:
-        """Note for the next time what is installed."""
-        self._stamp.write_text(json.dumps(self._stamp_for(sorted(self.extras))), "utf-8")
-
-    def _stamp_for(self, extras: list[str]) -> dict[str, object]:
-        locks = sorted((self._root / LOCKS).glob("*.txt"))
-        digest = hashlib.sha256()
-        for file in (self._root / "pyproject.toml", *locks):
-            digest.update(hashlib.sha256(file.read_bytes()).digest())
-        return {"files": digest.hexdigest(), "extras": extras}
-
     def python_version(self) -> tuple[int, int] | None:
         """The version of its Python, or ``None`` where ``.venv`` is absent or cannot be used."""
-        if (self.folder / LOG).exists() and not self._stamp.exists():
-            return None  # an installation was interrupted: pip would take half a package for whole
+        if self._unfinished.exists():
+            return None
         try:
             # A virtual environment that was moved or copied calls the programs of the old one.
             is_ours = str(self.folder) in (self.folder / "bin" / "pip").read_text("utf-8")[:1000]
@@ -377,19 +355,10 @@ class Environment:
         self._progress.step(f"making .venv with Python {platform.python_version()}")
         # Inside a virtual environment (even the one to be replaced) venv needs the base Python.
         base = getattr(sys, "_base_executable", sys.executable)
-        command = [base, "-m", "venv", "--clear", str(self.folder)]
-        made = subprocess.run(
-            command, env=clean_environment(os.environ), capture_output=True, text=True, check=False
-        )
-        version = sys.version_info[:2]
-        if made.returncode:
+        if why := make_venv([base, "-m", "venv", "--clear", str(self.folder)], os.environ):
             shutil.rmtree(self.folder, ignore_errors=True)
-            output = (made.stdout + made.stderr).strip()
-            if re.search(r"ensurepip|No module named '?venv", output):
-                remedy = system_install(apt=f"python{dotted(version)}-venv", dnf="python3-pip")
-                raise EnvironmentFault(f"this Python has no venv: {remedy}, then install.py again")
-            raise EnvironmentFault(f".venv cannot be made: {output or made.returncode}")
-        return version
+            raise EnvironmentFault(f".venv cannot be made: {why}; then install.py again")
+        return sys.version_info[:2]
 
     def _leave_out_nest(self, version: tuple[int, int]) -> None:
         if version > NEWEST_FOR_NEST and "nest" in self.extras:
@@ -400,10 +369,9 @@ class Environment:
             )
 
     def _fill(self) -> None:
-        self._stamp.unlink(missing_ok=True)
+        self._unfinished.touch()
         environ = {**clean_environment(os.environ), **self._pip_settings}
         install(self.python, self._root, self.extras, self._progress, environ, newest=self._newest)
-        self._is_filled = True
 
     def _prove(self) -> list[str]:
         """Use every part in a process of its own; one sentence for each that fails."""

@@ -1,4 +1,4 @@
-"""Installs packages with uv, or with pip where there is no uv; explains their errors."""
+"""Installs packages with uv, which pip installs where it is not there; explains their errors."""
 
 from __future__ import annotations
 
@@ -9,27 +9,32 @@ import re
 import shutil
 import ssl
 import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from neuros.errors import EnvironmentFault
-from neuros.installation.machine import IN_DOCKER, answer_of, other_python, system_install
+from neuros.installation.machine import (
+    IN_DOCKER,
+    answer_of,
+    clean_environment,
+    other_python,
+    system_install,
+)
 from neuros.installation.progress import Progress
 
 LOG = "neuros-install.log"
-"""What pip and uv wrote, in ``.venv``."""
+"""What uv and pip wrote, in ``.venv``."""
 
 LOCKS = "requirements"
 """The folder of the lock files, which ``.ci/lock`` writes."""
 
 UV = "uv>=0.9,<1"
-_OLDEST_UV = (0, 9)
-_UV_TIMEOUT_S = 20.0
 
-PIP_INSTALL = (
+_PIP_INSTALL = (
     *("-m", "pip", "install", "--disable-pip-version-check", "--no-input"),
-    *("--progress-bar", "off", "--prefer-binary"),
+    *("--progress-bar", "off", "--only-binary", ":all:"),
 )
 # As pip: every index counts, and modules are compiled, so that no start has to.
 _UV_INSTALL = ("pip", "install", "--index-strategy", "unsafe-best-match")
@@ -105,11 +110,7 @@ def install(
     source = environ.get("PIP_FIND_LINKS", "a folder") if is_without_index else "PyPI"
     progress.step(f"installing neuros{names} from {source} (log: {installer.log})")
     is_locked = not newest and not is_without_index
-    get_uv = [*_locked(root, "uv")] if is_locked else [UV]
-    uv = find_uv(python, environ) or _install_uv(installer, get_uv)
-    calls = [["--editable", f".{names}"]]
-    if newest:
-        calls[0].append("--upgrade")
+    calls = [["--editable", f".{names}", *(["--upgrade"] if newest else [])]]
     if is_locked:
         # No build isolation: it would take a setuptools that no lock file names.
         calls = [
@@ -117,9 +118,12 @@ def install(
             ["--no-build-isolation", *_locked(root, "core", *extras)],
             ["--no-build-isolation", "--no-deps", "--editable", "."],
         ]
-    output = installer.install(calls, uv)
-    if output is not None:
-        raise installer.fault(output)
+    try:
+        installer.require_uv(_locked(root, "uv") if is_locked else [UV])
+        for arguments in calls:
+            installer.install(arguments)
+    except InstallationFailed as failure:
+        raise installer.fault(failure.output) from failure
 
 
 def _locked(root: Path, *names: str) -> list[str]:
@@ -128,32 +132,32 @@ def _locked(root: Path, *names: str) -> list[str]:
     return ["--require-hashes", "--no-deps", *files]
 
 
-def find_uv(python: Path, environ: Mapping[str, str]) -> Path | None:
-    """The uv beside ``python``, else one on ``PATH`` that is new enough, else ``None``."""
-    beside = python.with_name("uv")
-    if os.access(beside, os.X_OK):
-        return beside
-    on_path = shutil.which("uv", path=environ.get("PATH"))
-    answer = answer_of([on_path, "--version"], environ, _UV_TIMEOUT_S) if on_path else None
-    match = re.match(r"uv (\d+)\.(\d+)", answer.stdout if answer else "")
-    is_new = match is not None and (int(match[1]), int(match[2])) >= _OLDEST_UV
-    return Path(on_path) if on_path and is_new else None
+def find_uv(python: Path) -> Path | None:
+    """The uv beside ``python`` or beside the Python that runs this, or ``None``."""
+    folders = (python.parent, Path(sys.executable).parent)
+    found = shutil.which("uv", path=os.pathsep.join(map(str, folders)))
+    return Path(found) if found else None
 
 
-def _install_uv(installer: Installer, what: Sequence[str]) -> Path | None:
-    """Install uv beside Python; ``None``, and a line for the user, where it cannot be had.
+def make_venv(command: Sequence[str], environ: Mapping[str, str]) -> str:
+    """Run ``python -m venv``; returns why it failed, and what to do, or an empty text."""
+    python, made = command[0], answer_of(command, clean_environment(environ))
+    if made is None or not made.returncode:
+        return "" if made else f"{python} cannot be started"
+    output = made.stdout + made.stderr
+    if re.search(r"ensurepip|No module named '?venv", output):
+        version = re.search(r"\d\.\d+$", python) or ("3",)
+        remedy = system_install(apt=f"python{version[0]}-venv", dnf="python3-pip")
+        return f"{python} has no venv: {remedy}"
+    return explain_machine(output) or (output.strip().splitlines() or ["venv failed"])[-1]
 
-    Raises:
-        EnvironmentFault: where nothing else could be installed either.
-    """
-    installer.progress.detail("installing uv")
-    output = installer.run([str(installer.python), *PIP_INSTALL, *what])
-    if output is None:
-        return find_uv(installer.python, installer.environ)
-    if explain_machine(output):
-        raise installer.fault(output)
-    installer.progress.step("there is no uv for this machine: using pip, which takes longer")
-    return None
+
+class InstallationFailed(Exception):
+    """uv or pip failed; ``output`` is all that it wrote."""
+
+    def __init__(self, output: str) -> None:
+        super().__init__(output)
+        self.output = output
 
 
 @dataclass(frozen=True)
@@ -173,61 +177,58 @@ class Installer:
     progress: Progress
     environ: Mapping[str, str]
 
-    def install(self, calls: Sequence[Sequence[str]], uv: Path | None) -> str | None:
-        """Install once for each of ``calls`` (arguments that uv and pip share).
-
-        Where uv fails, pip tries: it gets through some proxies that stop uv, and what pip says is
-        what callers explain.
-
-        Returns:
-            ``None``, or all that the program wrote that failed.
+    def require_uv(self, what: Sequence[str] = (UV,)) -> Path:
+        """The uv to use; where there is none, pip installs it beside Python.
 
         Raises:
-            OSError: if a program cannot be started, or the log cannot be written.
+            InstallationFailed: if pip cannot.
+            OSError: if pip cannot be started, or the log cannot be written.
         """
-        if uv:
-            listing = answer_of([str(self.python), "-m", "pip", "config", "list"], self.environ)
-            in_uv = uv_settings(listing.stdout if listing else "", self.environ)
-            if in_uv is None:
-                self.progress.step("uv does not know all settings that pip has here: using pip")
-            else:
-                if any("--require-hashes" in arguments for arguments in calls):
-                    # Lock files name every version, and uv refuses a constraint without a hash.
-                    in_uv.pop("UV_CONSTRAINT", None)
-                command = [str(uv), *_UV_INSTALL, "--python", str(self.python)]
-                output = self._run_each(command, calls, {**_AS_PIP, **self.environ, **in_uv})
-                if output is None or re.search(f"{_DISK_IS_FULL}|{_NOT_FOR_PROCESSOR}", output):
-                    return output  # pip would not find more
-                self.progress.step(f"uv failed: trying pip (log: {self.log})")
-        return self._run_each([str(self.python), *PIP_INSTALL], calls, self.environ)
+        if found := find_uv(self.python):
+            return found
+        self.progress.detail("installing uv")
+        self._run([str(self.python), *_PIP_INSTALL, *what], self.environ)
+        return self.python.with_name("uv")
+
+    def install(self, arguments: Sequence[str], python: Path | None = None) -> str:
+        """Run ``uv pip install``, with pip's settings; returns what it wrote.
+
+        Args:
+            python: for which Python, if not for this installer's.
+
+        Raises:
+            InstallationFailed: if uv fails, or is not there and cannot be installed.
+            OSError: if it cannot be started, or the log cannot be written.
+        """
+        uv, pip = self.require_uv(), [str(self.python), "-m", "pip", "config", "list"]
+        listing = answer_of(pip, self.environ)
+        settings, unknown = uv_settings(listing.stdout if listing else "", self.environ)
+        if unknown:
+            names = ", ".join(unknown)
+            self.progress.step(f"uv has no setting like pip's {names}, and goes without")
+        if "--require-hashes" in arguments:
+            # Lock files name every version, and uv refuses a constraint without a hash.
+            settings.pop("UV_CONSTRAINT", None)
+        command = [str(uv), *_UV_INSTALL, "--python", str(python or self.python), *arguments]
+        return self._run(command, {**_AS_PIP, **self.environ, **settings})
 
     def fault(self, output: str) -> EnvironmentFault:
         """The error for what the program that failed has written, of which it shows the end."""
         rows = [row.strip() for row in output.splitlines()]
-        errors = [row for row in rows if row.lower().startswith(("error", "fatal error"))]
+        errors = [row for row in rows if row.lower().startswith(("error", "cause", "fatal error"))]
         for row in (errors or rows)[-4:]:
             self.progress.step(f"  {row[:300]}")
-        return EnvironmentFault(f"{explain_failure(output) or 'pip failed'} (log: {self.log})")
+        return EnvironmentFault(f"{explain_failure(output) or 'uv failed'} (log: {self.log})")
 
-    def _run_each(
-        self, command: Sequence[str], calls: Sequence[Sequence[str]], environ: Mapping[str, str]
-    ) -> str | None:
-        outputs = (self.run([*command, *arguments], environ) for arguments in calls)
-        return next((output for output in outputs if output is not None), None)
-
-    def run(self, command: Sequence[str], environ: Mapping[str, str] | None = None) -> str | None:
-        """Run pip or uv and show what it does; ``None``, or its output if it failed.
-
-        Raises:
-            OSError: if it cannot be started, or the log cannot be written.
-        """
+    def _run(self, command: Sequence[str], environ: Mapping[str, str]) -> str:
+        """Run pip or uv, show what it does, and return what it wrote."""
         rows: list[str] = []
         with (
             self.log.open("a", encoding="utf-8") as file,
             subprocess.Popen(
                 command,
                 cwd=self.folder,
-                env=environ or self.environ,
+                env=environ,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
@@ -243,39 +244,32 @@ class Installer:
             except BaseException:
                 process.terminate()
                 raise
-        return "".join(rows) if process.returncode else None
+        if process.returncode:
+            raise InstallationFailed("".join(rows))
+        return "".join(rows)
 
 
 def _show(row: str, progress: Progress) -> None:
-    if row.startswith("Installing collected packages"):
-        progress.step(f"unpacking {row.count(',') + 1} packages")
-    elif prepared := re.match(r"Prepared (\d+) packages", row):
+    if prepared := re.match(r"Prepared (\d+) packages", row):
         progress.step(f"unpacking {prepared[1]} packages")
-    elif re.match(r"\s*(Collecting|Downloading|Building|Running)", row):
-        progress.detail(row.partition(" (from ")[0].strip())
+    elif re.match(r"\s*(Collecting|Downloading|Building)", row):
+        progress.detail(row.strip())
 
 
-def uv_settings(listing: str, environ: Mapping[str, str]) -> dict[str, str] | None:
-    """The environment variables that give uv the settings of pip.
+def uv_settings(listing: str, environ: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
+    """The environment variables that give uv the settings of pip, and settings that uv has not.
 
     uv reads none of pip's files and variables. Its own variables, where the user has set them,
     stay.
 
     Args:
         listing: what ``pip config list`` says.
-
-    Returns:
-        ``None`` if pip has settings that uv has not.
     """
     rows = re.findall(r"^(global|install|:env:)\.([\w-]+)=(.+)$", listing, re.MULTILINE)
     # A variable comes before a file, and a setting of one command before those of all.
     rows.sort(key=lambda row: ("global", "install", ":env:").index(row[0]))
-    found: dict[str, str] = {}
-    for _, key, value in rows:
-        if key in _IN_UV:
-            found[_IN_UV[key]] = str(ast.literal_eval(value))
-        elif key not in _OF_NO_EFFECT:
-            return None
+    found = {_IN_UV[key]: str(ast.literal_eval(value)) for _, key, value in rows if key in _IN_UV}
+    unknown = sorted({key for _, key, _ in rows} - _IN_UV.keys() - _OF_NO_EFFECT)
     if links := found.pop("UV_FIND_LINKS", ""):
         # pip passes over a folder that is not there; for uv it is an error.
         there = [link for link in links.split() if "://" in link or os.path.exists(link)]
@@ -292,7 +286,8 @@ def uv_settings(listing: str, environ: Mapping[str, str]) -> dict[str, str] | No
         # Authorities of this machine, as for pip; uv has its own where there are none.
         cafile = ssl.get_default_verify_paths().cafile
         found |= {"UV_SYSTEM_CERTS": "1"} if cafile else {}
-    return {k: v for k, v in found.items() if not (k.startswith("UV_") and environ.get(k))}
+    mine = {k: v for k, v in found.items() if not (k.startswith("UV_") and environ.get(k))}
+    return mine, unknown
 
 
 def explain_failure(text: str) -> str | None:
@@ -308,14 +303,24 @@ def explain_failure(text: str) -> str | None:
             f"the package index has no {match['package']} for this processor ({match['platform']}):"
             f" use Docker, {IN_DOCKER}"
         )
-    sentence = explain_machine(text)
-    if sentence is None and re.search("No matching distribution|Could not find a version", text):
+    if sentence := explain_machine(text):
+        return sentence
+    if cause := why_unsatisfiable(text):
         return (
-            "a package does not exist for this Python or processor: run"
+            f"a package does not exist for this Python or processor ({cause}): run"
             f" {other_python()} install.py (with --wheelhouse: or it is not in there; with an index"
             " of your own: --newest takes the versions that it has)"
         )
-    return sentence
+    return None
+
+
+def why_unsatisfiable(text: str) -> str:
+    """Why uv, or pip that installs uv, finds no package that will do; empty for other errors."""
+    if found := re.search(r"ERROR: (No matching distribution found for .+)", text):
+        return found[1]
+    solution = r"No solution found.*?Because (.+?)(?:,\s+we\s+can\s+conclude|\n\n|\Z)"
+    found = re.search(solution, text, re.DOTALL)
+    return " ".join(found[1].split()) if found else ""
 
 
 def explain_machine(text: str, again: str = "install.py") -> str | None:
@@ -323,14 +328,14 @@ def explain_machine(text: str, again: str = "install.py") -> str | None:
     for pattern, sentence in (
         (_DISK_IS_FULL, "the disk is full: make room (df -h)"),
         (
-            "CERTIFICATE_VERIFY_FAILED",
+            "CERTIFICATE_VERIFY_FAILED|invalid peer certificate",
             "the certificate of the package index is not trusted: "
             "export PIP_CERT=/path/to/your/authority.pem",
         ),
         (
             "Name or service not known|name resolution|NewConnectionError|ConnectTimeout|"
             "ReadTimeout|ProxyError|Network is unreachable|Max retries exceeded|"
-            "Connection refused|Connection reset",
+            r"Connection refused|Connection reset|client error \(Connect\)|operation timed out",
             "the package index https://pypi.org cannot be reached: check the network "
             f"(behind a proxy: export HTTPS_PROXY=http://HOST:PORT), then {again} again",
         ),

@@ -20,7 +20,7 @@ from neuros.backends.pythons import (
     require_one_python,
     wanted_version,
 )
-from neuros.backends.virtual_environments import why_no_files, why_no_venv, why_pip_failed
+from neuros.backends.virtual_environments import why_no_files, why_uv_failed
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
 
@@ -227,56 +227,37 @@ class TestRuns:
 
 # ------------------------------------------------------------------ failures
 
-CONFLICT = """\
-ERROR: Cannot install jsonschema<4 and jsonschema<5 because these have conflicting dependencies.
-
-The conflict is caused by:
-    The user requested jsonschema<5
-    The user requested jsonschema<4
-
-To fix this you could try to:
+UNSATISFIABLE = """\
+error: No solution found when resolving dependencies
+  cause: Because {}, we can conclude that your requirements are unsatisfiable.
 """
-NONE = "ERROR: Could not find a version that satisfies the requirement {} (from versions: {})\n"
 
 
 @pytest.mark.parametrize(
     ("output", "sentence"),
     [
         (
-            NONE.format("a==9", "1, 2, 3, 4, 5, 6, 7"),
-            "no a==9 exists for Python 3.12 (there is ..., 3, 4, 5, 6, 7)",
+            UNSATISFIABLE.format("there is no version of a==9 and you require a==9"),
+            "there is no version of a==9 and you require a==9 (for Python 3.12)",
         ),
         (
-            NONE.format("a==9", "1"),
-            "no a==9 exists for Python 3.12 (there is 1)",
+            UNSATISFIABLE.format("you require jsonschema<4 and jsonschema>=4,<5"),
+            "you require jsonschema<4 and jsonschema>=4,<5 (for Python 3.12);"
+            " NeuROS needs jsonschema<5,>=4",
         ),
-        (
-            NONE.format("a", "none"),
-            "no a exists for Python 3.12 (pip finds no package of that name)",
-        ),
-        (
-            CONFLICT,
-            "these exclude each other: The user requested jsonschema<5; The user requested"
-            " jsonschema<4; NeuROS needs jsonschema<5,>=4",
-        ),
-        ("Looking\nERROR: Invalid requirement: 'a b'\nmore\n", "Invalid requirement: 'a b'"),
-        ("", "pip failed"),
+        ("error: Failed to parse: `a b`\n  cause: Expected", "Failed to parse: `a b`: Expected"),
+        ("", "uv failed"),
     ],
 )
-def test_what_pip_says(output: str, sentence: str) -> None:
-    assert why_pip_failed(output, "3.12", ["jsonschema<5,>=4", "tabulate"]) == sentence
+def test_what_uv_says(output: str, sentence: str) -> None:
+    assert why_uv_failed(output, "3.12", ["jsonschema<5,>=4", "tabulate"]) == sentence
 
 
 def test_without_a_network_no_package_is_blamed() -> None:
-    output = "NewConnectionError\n" + NONE.format("a", "none")
-    sentence = why_pip_failed(output, "3.12", [])
+    output = "Connection refused\n" + UNSATISFIABLE.format("a was not found")
+    sentence = why_uv_failed(output, "3.12", [])
     assert "cannot be reached" in sentence
     assert sentence.endswith("then launch again")
-
-
-def test_a_python_without_venv_is_told_what_to_install() -> None:
-    assert "python3.12-venv" in why_no_venv("No module named venv", "3.12")
-    assert why_no_venv("first\nlast", "3.12") == "last"
 
 
 def test_a_folder_that_cannot_be_written_is_named() -> None:

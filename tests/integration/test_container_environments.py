@@ -67,7 +67,7 @@ class Project:
             "NEUROS_BACKEND": "process",
             "PIP_NO_INDEX": "1",
             "PIP_FIND_LINKS": str(self.index),
-            "PIP_NO_CACHE_DIR": "1",
+            "UV_CACHE_DIR": str(self.cache.parent / "uv"),
             "PIP_CONFIG_FILE": os.devnull,
             "XDG_CACHE_HOME": str(self.cache),
         }
@@ -201,8 +201,8 @@ def test_what_cannot_be_satisfied_is_said_at_once_and_leaves_nothing(project: Pr
     sentences = [row for row in run.output.splitlines() if "container '" in row and "log:" in row]
     sentences = [row for row in sentences if not row.startswith("[")]
     assert len(sentences) == 3, run.output
-    assert "no neuros_colour==7 exists for Python" in sentences[0]
-    assert "(there is 1.0) (log: " in sentences[0]
+    assert "there is no version of neuros-colour==7 and you require" in sentences[0]
+    assert "(for Python {}.{}) (log: ".format(*HERE) in sentences[0]
     assert "containers/torn/requirements.txt" in sentences[1]
     assert "jsonschema" in sentences[2]
     assert "Traceback" not in run.output
