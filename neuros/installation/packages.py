@@ -352,6 +352,6 @@ def explain_machine(text: str, again: str = "install.py") -> str | None:
 
 
 def _needed_bytes(extras: Sequence[str]) -> float:
-    """Room for the packages and for pip's copies of them while it works."""
+    """Room for the packages and for uv's copies of them while it works."""
     per_extra = {"tensorflow": 2.5e9, "dev": 0.2e9, "docs": 0.2e9, "benchmark": 0.4e9}
     return 1.0e9 + sum(per_extra.get(extra, 0.0) for extra in extras)

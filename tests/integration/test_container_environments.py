@@ -38,6 +38,25 @@ def begin(node):
         node.shutdown("seen")
 """
 
+BACKEND = """
+import pathlib, zipfile
+
+def build_editable(target, config_settings=None, metadata_directory=None):
+    name, info = "neuros_colour-1.0-py3-none-any.whl", "neuros_colour-1.0.dist-info"
+    files = {
+        "neuros_colour.pth": str(pathlib.Path.cwd()),
+        f"{info}/METADATA": "Metadata-Version: 2.1\\nName: neuros_colour\\nVersion: 1.0\\n",
+        f"{info}/WHEEL": "Wheel-Version: 1.0\\nRoot-Is-Purelib: true\\nTag: py3-none-any\\n",
+    }
+    files[f"{info}/RECORD"] = "".join(f"{each},,\\n" for each in [*files, f"{info}/RECORD"])
+    with zipfile.ZipFile(pathlib.Path(target, name), "w") as wheel:
+        for each, text in files.items():
+            wheel.writestr(each, text)
+    return name
+
+build_wheel = build_editable
+"""
+
 
 class Project:
     """A node in a container that needs a package of an index of its own; no network."""
@@ -173,6 +192,33 @@ def test_a_script_runs_in_front_of_a_node_with_an_environment_of_its_own(project
     assert run.exit_code == 0, run.output
     assert "[last] hello" in run.output
     assert run.said("last") == ["the colour is red"]
+    (environment,) = (path for path in project.environments.iterdir() if path.is_dir())
+    installed = [path.name for path in environment.glob("lib/*/site-packages/*.dist-info")]
+    assert installed == ["neuros_colour-1.0.dist-info"], "all else is that of the launcher"
+
+
+def test_a_package_with_another_hash_than_the_container_names_is_refused(project: Project) -> None:
+    make_wheel(project.index, "neuros_colour", "1.0", "NAME = 'red'")
+    project.node("last", "exact", f"neuros_colour==1.0 --hash=sha256:{'0' * 64}")
+    run = project.launch()
+    assert run.exit_code == 4
+    assert "Hash mismatch for `neuros-colour==1.0`" in run.output
+    assert project.left() == []
+
+
+def test_an_editable_package_is_run_where_it_lies(project: Project) -> None:
+    folder = project.folder / "colour"
+    folder.mkdir()
+    (folder / "neuros_colour.py").write_text("NAME = 'red'")
+    (folder / "backend.py").write_text(BACKEND)
+    (folder / "pyproject.toml").write_text(
+        '[build-system]\nrequires = []\nbuild-backend = "backend"\nbackend-path = ["."]\n'
+        '[project]\nname = "neuros_colour"\nversion = "1.0"\n'
+    )
+    project.node("last", "editable", f"-e {folder}")
+    assert project.launch().said("last") == ["the colour is red"]
+    (folder / "neuros_colour.py").write_text("NAME = 'blue'")
+    assert project.launch().said("last") == ["the colour is blue"]
 
 
 def test_two_launches_at_once_make_one_environment(project: Project) -> None:
