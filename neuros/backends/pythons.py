@@ -43,7 +43,7 @@ FILE = ".python-version"
 _VERSION = re.compile(r"(?:c?python-?)?(\d+)\.(\d+)(?:\.\d+)*")
 _ASK = "import sys; print(sys.implementation.name, *sys.version_info[:2])"
 _ANSWER_TIMEOUT_S = 10.0
-_FORMAT = 1  # of what is made: another one makes all environments anew
+_FORMAT = 2  # of what is made: another one makes all environments anew
 
 
 def wanted_version(folder: Path) -> Version | None:

@@ -8,13 +8,12 @@ On another version of Python it has everything, ROS 2 included.
 
     ~/.cache/neuros/environments/     (or $XDG_CACHE_HOME/neuros/environments)
         <container>-<key>/            a virtual environment
-        <container>-<key>.json        says that it is whole, and which Python to run
+        <container>-<key>.here        the launcher's own environment does; there is no folder
         <container>-<key>.lock        only while somebody makes it
         <container>-<key>.log         what uv wrote
 
-The ``.json`` is written last, in one step: what was interrupted never looks whole. There are some
-without a folder: they remember that the launcher's own environment does, which saves the next
-start from reading the metadata of packages.
+A file ``neuros-whole`` comes last into an environment: what was interrupted never looks whole. A
+``.here`` saves the next start from reading the metadata of packages.
 
 ``requirements.txt`` is read as pip reads it, and compared with what is installed here. The format:
 https://pip.pypa.io/en/stable/reference/requirements-file-format/
@@ -72,7 +71,8 @@ class Entry(Kept):
 
     @property
     def stamp(self) -> Path:
-        return self.beside(".json")
+        """An empty file: the environment is whole; without one, the launcher's own Python does."""
+        return self.folder / "neuros-whole" if self.folder.exists() else self.beside(".here")
 
     @property
     def future_python(self) -> Path:
@@ -81,36 +81,18 @@ class Entry(Kept):
 
     def python(self) -> Path | None:
         """The Python to run, if that has been settled and is there."""
-        try:
-            is_here = json.loads(self.stamp.read_text("utf-8"))["is_here"]
-        except (OSError, ValueError, LookupError, TypeError):
-            return None
-        python = Path(sys.executable) if is_here else self.future_python
-        return python if os.access(python, os.X_OK) else None
+        python = self.future_python if self.folder.exists() else Path(sys.executable)
+        return python if self.stamp.exists() and os.access(python, os.X_OK) else None
 
-    def note_use(self) -> None:
-        """Keep it from being removed as unused."""
-        with contextlib.suppress(OSError):
-            os.utime(self.stamp)
-
-    def settle(self, *, is_here: bool) -> None:
-        """From now on it is whole; or, where ``is_here``, the launcher's own Python does.
-
-        Raises ``OSError``.
-        """
-        self.stamp.parent.mkdir(parents=True, exist_ok=True)
-        draft = self.beside(f".json.{os.getpid()}")
-        try:
-            draft.write_text(json.dumps({"is_here": is_here}), "utf-8")
-            draft.replace(self.stamp)
-        finally:
-            draft.unlink(missing_ok=True)
+    def settle(self) -> None:
+        """From now on it is what the stamp says, and in use. Raises ``OSError``."""
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        self.stamp.touch()
 
     def remove(self) -> None:
         """Remove it, as far as that is possible; the log stays."""
         with contextlib.suppress(OSError):
-            for file in self.folder.parent.glob(f"{self.folder.name}.json*"):
-                file.unlink(missing_ok=True)
+            self.stamp.unlink(missing_ok=True)  # first: half of it must not count as whole
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
@@ -170,11 +152,8 @@ class Choice:
 
         Raises ``OSError``.
         """
-        if self.base is not None:
-            return
-        if self.entry.python() is None:
-            self.entry.settle(is_here=True)
-        self.entry.note_use()
+        if self.base is None and (self.entry.python() or not self.entry.folder.exists()):
+            self.entry.settle()
 
 
 def own_needs() -> list[str]:
@@ -222,7 +201,7 @@ def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]
         _make_venv(choice, progress, run_environment)
         _add_links(choice)
         _install(choice, progress, run_environment)
-        entry.settle(is_here=False)
+        entry.settle()
     except BaseException:
         entry.remove()
         raise

@@ -135,6 +135,14 @@ class TestChoices:
         choice.settle()
         assert project.choice("snn").path == Path(sys.executable)
 
+    def test_half_an_environment_is_not_settled_as_whole(self, project: Project) -> None:
+        project.container("snn", "jsonschema")
+        choice = project.choice("snn")
+        choice.entry.future_python.parent.mkdir(parents=True)
+        choice.entry.future_python.symlink_to(sys.executable)
+        choice.settle()
+        assert choice.entry.python() is None
+
     def test_what_it_lacks_gets_an_environment_on_top_of_it(self, project: Project) -> None:
         project.container("snn", "jsonschema<4")
         choice = project.choice("snn")

@@ -37,27 +37,22 @@ def test_it_is_where_caches_are() -> None:
 def test_what_has_not_been_settled_is_not_there(entry: Entry) -> None:
     make(entry)
     assert entry.python() is None
-    entry.settle(is_here=False)
+    entry.settle()
     assert entry.python() == entry.folder / "bin/python"
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"is_he'])
-def test_half_a_stamp_settles_nothing(entry: Entry, text: str) -> None:
-    make(entry)
-    entry.stamp.write_text(text)
+    entry.remove()
     assert entry.python() is None
 
 
 def test_an_environment_whose_python_has_gone_is_not_there(entry: Entry) -> None:
     make(entry)
-    entry.settle(is_here=False)
+    entry.settle()
     entry.future_python.unlink()
     entry.future_python.symlink_to("/nowhere/python3.11")
     assert entry.python() is None
 
 
 def test_that_this_python_does_is_remembered_without_a_folder(entry: Entry) -> None:
-    entry.settle(is_here=True)
+    entry.settle()
     assert entry.python() == Path(sys.executable)
     assert not entry.folder.exists()
 
@@ -75,7 +70,7 @@ def test_only_one_can_have_it_and_the_next_sees_what_was_made(entry: Entry) -> N
             assert not is_others
         waiting = threading.Thread(target=wait_and_look)
         waiting.start()
-        entry.settle(is_here=True)
+        entry.settle()
     waiting.join(10)
     assert seen == [Path(sys.executable)]
     assert not list(entry.folder.parent.glob("*.lock"))
@@ -88,16 +83,15 @@ def test_what_was_interrupted_and_what_nobody_uses_is_swept(tmp_path: Path) -> N
     for each in (used, unused, interrupted, working):
         make(each)
     for each in (used, unused):
-        each.settle(is_here=False)
+        each.settle()
         os.utime(each.stamp, (MONTHS_AGO_S, MONTHS_AGO_S))
-    used.note_use()
+    used.settle()
     (tmp_path / "of-somebody-else").mkdir()
     with working.locked():
         sweep(tmp_path)
         assert working.folder.is_dir()
     assert {path.name for path in tmp_path.iterdir()} == {
         f"used-{KEY}",
-        f"used-{KEY}.json",
         f"working-{KEY}",
         "of-somebody-else",
     }
