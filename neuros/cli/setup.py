@@ -130,9 +130,8 @@ def add_containers(containers: argparse.ArgumentParser) -> None:
 
 
 def _build_images(options: argparse.Namespace) -> int:
-    from neuros.backends.docker.builders import served, surroundings
-    from neuros.backends.docker.building import ImageBuilder
-    from neuros.backends.docker.engine import connect
+    from neuros.backends.docker.building import ImageBuilder, served, surroundings
+    from neuros.backends.docker.engine import connect, require_program
     from neuros.installation.progress import Progress
 
     bases = dict(_pair(text, "neuros_python") for text in options.base_image)
@@ -140,15 +139,15 @@ def _build_images(options: argparse.Namespace) -> int:
     recipes, images = _wanted(options.names or STANDARD)
     wheelhouse = _file_or_folder(options.wheelhouse, "--wheelhouse", is_folder=True)
     bundle = _file_or_folder(options.ca_bundle, "--ca-bundle", is_folder=False)
-    try:
-        connection = connect(timeout_s=None)
-    except EnvironmentFault as fault:
-        if not options.if_engine:
-            raise
-        print(f"no containers are built, so projects run as processes: {fault}")
-        return 0
     with ExitStack() as stack:
-        engine = stack.enter_context(closing(connection))
+        try:
+            engine = stack.enter_context(closing(connect(timeout_s=None)))
+            require_program()
+        except EnvironmentFault as fault:
+            if not options.if_engine:
+                raise
+            print(f"no containers are built, so projects run as processes: {fault}")
+            return 0
         wheels = stack.enter_context(served(wheelhouse)) if wheelhouse else ""
         around = surroundings(engine, os.environ, bundle, wheels)
         progress, logs = Progress(sys.stdout), cache_root(os.environ) / "builds"

@@ -12,8 +12,6 @@ from neuros.backends.docker.dockerfile import (
     after_each_from,
     arguments_of,
     images_in,
-    label_line,
-    needs_buildkit,
     on_images,
 )
 from neuros.errors import EnvironmentFault
@@ -95,39 +93,6 @@ class TestImagesInDockerfiles:
     def test_the_arguments_that_it_declares_are_known(self) -> None:
         text = "ARG A\nFROM x\n arg B=1 D='2 E'\nRUN echo ARG C"
         assert arguments_of(text) == {"A", "B", "D"}
-
-    @pytest.mark.parametrize(
-        ("dockerfile", "line", "what"),
-        [
-            ("FROM a\n\nRUN echo \\\n  --mount=x\nRUN --mount=type=cache a", 5, "RUN --mount"),
-            ("FROM a\nRUN --network=none \\\n a", 2, "RUN --network"),
-            ("FROM a\nRUN cat <<EOF > /x\nhello\nEOF", 2, "RUN <<EOF"),
-            ('FROM a\nCOPY <<-"END" /x\nhello\nEND', 2, "COPY <<END"),
-            ("FROM a\nCOPY --from=b --chmod=644 x /", 2, "COPY --chmod"),
-            ("FROM a\nARG TARGETARCH", 2, "ARG TARGETARCH"),
-            ("FROM --platform=$BUILDPLATFORM a", 1, "FROM BUILDPLATFORM"),
-        ],
-    )
-    def test_what_only_buildkit_understands_is_named_with_its_line(
-        self, dockerfile: str, line: int, what: str
-    ) -> None:
-        found = needs_buildkit(dockerfile)
-        assert found is not None
-        assert (found[0].first, found[1]) == (line, what)
-
-    @pytest.mark.parametrize(
-        "dockerfile",
-        [
-            "FROM a\nRUN echo $((1 << 2)) --mount=x",
-            "# syntax=docker/dockerfile:1\nFROM --platform=linux/amd64 a\nCOPY --from=a x /",
-            "FROM a\nRUN cat <<< word\nENV A=<<EOF",
-        ],
-    )
-    def test_everything_else_is_for_the_classic_builder(self, dockerfile: str) -> None:
-        assert needs_buildkit(dockerfile) is None
-
-    def test_labels_are_one_step_whatever_is_in_them(self) -> None:
-        assert label_line({"b": 'a "$HOME" \\', "a": "1"}) == (r'LABEL a="1" b="a \"\$HOME\" \\"')
 
 
 class TestFinding:

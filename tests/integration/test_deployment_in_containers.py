@@ -156,7 +156,7 @@ def test_without_the_command_docker_it_is_said_how_to_get_it(tmp_path: Path) -> 
     file = deployment(tmp_path, {"sink": "box"}, docker=f"unix://{tmp_path}/nowhere")
     finished = launch(STREAM, "--deployment", file, cwd=tmp_path, PATH=str(tmp_path))
     assert finished.exit_code == 4, finished.output
-    assert "there is no command docker here: apt-get install docker.io" in finished.output
+    assert "there is no program docker here: sudo apt-get install docker.io" in finished.output
 
 
 @pytest.mark.needs("docker", "ssh")

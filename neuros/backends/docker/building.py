@@ -1,44 +1,46 @@
-"""Builds the images of recipes: parents first, what is current not again, a tag for the whole only.
+"""Builds the images of recipes with ``docker build``: parents first, what is current not again.
 
-Each image is built without a name, is run once to see that it can run nodes, gets what it lacks for
-that (the recipe ``neuros_python`` on top of it), and its tag last. The classic builder is used, and
-BuildKit where a Dockerfile takes it.
+Each image is built under a temporary name, is run once to see that it can run nodes, gets what it
+lacks for that (the recipe ``neuros_python`` on top of it), and its own names last. The program
+``docker`` chooses the builder: BuildKit where buildx is installed, else the classic one.
 """
 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
+import os
+import re
+import secrets
+import subprocess
+import tarfile
+import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
+from io import BytesIO
 from pathlib import Path
+from threading import Thread
 from types import MappingProxyType
-from typing import Any
+from typing import IO, Any
 
 from docker import DockerClient
 from docker.errors import APIError, ImageNotFound
 
-from neuros.backends.containers import BASE, BASE_ARGUMENT, Recipe, bare_name, find_recipe, in_order
-from neuros.backends.docker.builders import (
-    CERTIFICATES,
-    DOCKERFILE,
-    BuildLog,
-    Surroundings,
-    buildkit_messages,
-    context_of,
-    named,
-    require_buildkit,
+from neuros.backends.containers import (
+    BASE,
+    BASE_ARGUMENT,
+    Recipe,
+    bare_name,
+    files_of,
+    find_recipe,
+    in_order,
 )
-from neuros.backends.docker.dockerfile import (
-    after_each_from,
-    arguments_of,
-    images_in,
-    label_line,
-    needs_buildkit,
-    on_images,
-)
-from neuros.backends.docker.engine import engine_faults
+from neuros.backends.docker.dockerfile import after_each_from, arguments_of, images_in, on_images
+from neuros.backends.docker.engine import engine_faults, engine_socket
 from neuros.backends.docker.images import (
     CONTAINER,
     DIGEST,
@@ -53,17 +55,158 @@ from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.progress import Progress
 
+CERTIFICATES = "/tmp/neuros-ca-bundle.pem"
+"""Where a build finds the certificates that the user gives; it is taken away at the end."""
+
 _BASE = "neuros.image.base"
 _ARGUMENTS = "neuros.image.arguments"
 _FROM = "neuros.image.from"
+
+_CERTIFICATES_IN_CONTEXT = ".neuros-ca-bundle.pem"
+_TRUST = ("PIP_CERT", "SSL_CERT_FILE", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE")
+_PROXIES = ("HTTP_PROXY", "HTTPS_PROXY", "FTP_PROXY", "NO_PROXY", "ALL_PROXY")
 _NOTHING: Mapping[str, str] = MappingProxyType({})
+_NO_FILES: Mapping[str, bytes] = MappingProxyType({})
+
+_TEMPORARY = "neuros_building"
+"""The repository of images that are not finished."""
+
+_TAIL_LINES = 12
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
+_STEP = re.compile(r"step \d|#\d+ \[", re.IGNORECASE)  # of the classic builder, of BuildKit
+_SHOWN = re.compile(rf"{_STEP.pattern}|(#\d+ [\d.]+ )?\s*(Collecting|Downloading)", re.IGNORECASE)
+_ERROR = re.compile(r"(?:#\d+ [\d.]+ )?(E(?:RROR)?: .*)")
+
+# What a user can mend outside the Dockerfile. The first that fits what was said last tells why.
+_CAUSES = (
+    (r"no space left on device|\[Errno 28\]", "the disk is full: make room (docker system df)"),
+    (
+        r"CERTIFICATE_VERIFY_FAILED|x509: certificate",
+        "a certificate is not trusted: give your authority's with --ca-bundle FILE",
+    ),
+    (
+        r"requires BuildKit|dockerfile parse error.*unknown (flag|instruction)"
+        r"|BuildKit is enabled but the buildx component is missing",
+        "{said}: this may need a newer BuildKit: install docker-buildx (from docker.com:"
+        " docker-buildx-plugin; before docker 23: export DOCKER_BUILDKIT=1), or write it without",
+    ),
+    (
+        r"(?:Get|Head) \"?https?://(?P<what>[^/\"]+)|lookup (?P<also>\S+).* no such host",
+        "the registry {what} cannot be reached: check the network and the engine's proxy, or name"
+        " an image that the engine has with --base-image",
+    ),
+    (
+        r"pull access denied for (?P<what>[^\s,]+)|manifest for (?P<also>\S+) not found"
+        r"|(?P<third>\S+): pull access denied, repository does not exist"
+        r"|failed to resolve source metadata for (?P<fourth>\S+):",
+        "there is no image {what} to begin from: correct the FROM line, or name one that the engine"
+        " has with --base-image",
+    ),
+    (
+        r"Temporary failure in name resolution|Temporary failure resolving|NewConnectionError"
+        r"|Network is unreachable|Could not resolve|ConnectTimeout|ReadTimeout|ProxyError",
+        "the package index cannot be reached: check the network (behind a proxy: export"
+        " HTTPS_PROXY=http://HOST:PORT), or build from a folder of wheels with --wheelhouse DIR",
+    ),
+    (
+        r"Permission denied|are you root\?",
+        "a step may not write: images of NeuROS run as an ordinary user, so put USER 0 above it",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Needs of this machine that all builds share.
+
+    Attributes:
+        arguments: build arguments; the engine keeps proxies out of the images' history.
+        network: of the build, ``None`` for the engine's default.
+        ca_bundle: certificates to trust besides, PEM.
+        wheels: the address of a wheelhouse, or "".
+    """
+
+    arguments: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
+    network: str | None = None
+    ca_bundle: bytes = b""
+    wheels: str = ""
+
+    @property
+    def files(self) -> dict[str, bytes]:
+        """Files to lay beside every Dockerfile."""
+        return {_CERTIFICATES_IN_CONTEXT: self.ca_bundle} if self.ca_bundle else {}
+
+    @property
+    def lines(self) -> str:
+        """Lines to declare in every stage of a Dockerfile."""
+        lines = []
+        if self.ca_bundle:
+            lines.append(f"COPY {_CERTIFICATES_IN_CONTEXT} {CERTIFICATES}")
+            lines.append(f"ARG {' '.join(f'{name}={CERTIFICATES}' for name in _TRUST)}")
+        if self.wheels:
+            lines.append(f"ARG PIP_NO_INDEX=1 PIP_FIND_LINKS={self.wheels}")
+        return "\n".join(lines)
+
+
+def surroundings(
+    engine: DockerClient, environ: Mapping[str, str], ca_bundle: Path | None, wheels: str
+) -> Surroundings:
+    """Needs of this machine, from its environment and the engine.
+
+    A wheelhouse leaves proxies out, and packages of the operating system.
+    """
+    names = [name for upper in _PROXIES for name in (upper, upper.lower())]
+    proxies = {name: environ[name] for name in names if environ.get(name)}
+    is_here = any("127.0.0.1" in url or "localhost" in url for url in proxies.values())
+    has_bridge = any(network.name == "bridge" for network in engine.networks.list())
+    return Surroundings(
+        arguments={"SYSTEM_PACKAGES": "", "WINDOWS": "no"} if wheels else proxies,
+        network="host" if wheels or is_here or not has_bridge else None,
+        ca_bundle=ca_bundle.read_bytes() if ca_bundle else b"",
+        wheels=wheels,
+    )
+
+
+@contextlib.contextmanager
+def served(folder: Path) -> Iterator[str]:
+    """Serve a folder of wheels while an image is built without a package index; yields the address.
+
+    The classic builder has no mounts, and what is copied into an image stays in its layers. So pip
+    gets the wheels over HTTP from this machine, while the build uses this machine's network; only
+    programs of this machine reach the server.
+
+    Raises:
+        EnvironmentFault: if there are no wheels.
+    """
+    if not any(folder.glob("*.whl")):
+        raise EnvironmentFault(f"--wheelhouse {folder}: there are no wheels (*.whl) in this folder")
+    handler = partial(_Handler, directory=str(folder))
+    try:
+        # The builder caches by address, so the same folder has the same port if that is free.
+        port = 20000 + zlib.crc32(bytes(folder.resolve())) % 10000
+        server = ThreadingHTTPServer(("127.0.0.1", port), handler)
+    except OSError:
+        server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    thread = Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+class _Handler(SimpleHTTPRequestHandler):
+    def log_message(self, *_: object) -> None:
+        """Log nothing."""
 
 
 class ImageBuilder:
     """Builds images, with a line about each.
 
     Args:
-        logs: the folder for what the engine says.
+        logs: the folder for what ``docker build`` prints.
         bases: base images by container name, in place of those in the Dockerfiles.
         arguments: build arguments for the Dockerfiles that declare them.
         pull: whether the newest version of base images is asked for.
@@ -91,11 +234,29 @@ class ImageBuilder:
             EnvironmentFault: at the first that cannot be built; those before it are kept.
         """
         recipes = list(recipes)
+        bases: dict[str, str] = {}
         with engine_faults("images cannot be built"):
-            bases = self._remembered_bases(recipes) | dict(self._bases)
-        wanted = in_order(recipes, bases)
-        _require_use(self._bases, wanted)
-        for recipe in wanted:
+            for recipe in in_order(recipes):
+                old = built_image(recipe, self._engine)
+                # What the user wanted last time counts again.
+                if old and (base := old.labels.get(_BASE)) and recipe.takes(base):
+                    bases[recipe.name] = base
+        bases |= self._bases
+        wanted = {recipe.name: recipe for recipe in in_order(recipes, bases)}
+        for name, base in self._bases.items():
+            if name not in wanted:
+                names = ", ".join(sorted(wanted)) or "none"
+                raise UsageError(
+                    f"--base-image {name}={base}: no container '{name}' is built here (there are:"
+                    f" {names})"
+                )
+            if not wanted[name].takes(base):
+                raise UsageError(
+                    f"--base-image {name}={base}: {wanted[name].folder}/Dockerfile does not begin"
+                    f" from {BASE_ARGUMENT}: let it begin with 'ARG {BASE_ARGUMENT}=...' and"
+                    f" 'FROM ${{{BASE_ARGUMENT}}}', or write the image into its FROM line"
+                )
+        for recipe in wanted.values():
             with engine_faults(f"image '{recipe.name}' cannot be built"):
                 self._bring_up_to_date(recipe, bases.get(recipe.name, ""))
 
@@ -114,84 +275,65 @@ class ImageBuilder:
                     f"there is neither a folder containers/{name} nor an image '{name}': docker"
                     f" pull {name}, or correct the name"
                 ) from None
-            steps = self._steps(name)
-            made, python = steps.able(image.id)
-            if made == image.id:
-                self._progress.step(f"{name}: can run nodes as it is")
-                return
-            labels = {CONTAINER: name, **labels_of_python(python)}
-            steps.finish(made, [added_tag(image)], labels)
-            self._report(f"{name}: built {added_tag(image)}, with what nodes need", started_s)
+            with self._builds(name) as builds:
+                made, python = builds.able(name)
+                if made == name:
+                    self._progress.step(f"{name}: can run nodes as it is")
+                    return
+                labels = {CONTAINER: name, **labels_of_python(python)}
+                builds.finish(made, [added_tag(image)], labels)
+        took_s = time.monotonic() - started_s
+        self._progress.step(
+            f"{name}: built {added_tag(image)}, with what nodes need in {took_s:.1f} s"
+        )
 
-    def _steps(self, name: str) -> BuildSteps:
+    def _builds(self, name: str) -> _Builds:
         log = self._logs / f"{name.replace('/', '_')}.log"
-        return BuildSteps(self._engine, self._around, self._progress, name, log)
-
-    def _remembered_bases(self, recipes: Iterable[Recipe]) -> dict[str, str]:
-        """The base images that the user wanted when these were built last."""
-        built = [(recipe, built_image(recipe, self._engine)) for recipe in in_order(recipes)]
-        return {
-            recipe.name: base
-            for recipe, old in built
-            if old and (base := old.labels.get(_BASE)) and recipe.takes(base)
-        }
+        return _Builds(self._engine, self._around, self._progress, name, log)
 
     def _bring_up_to_date(self, recipe: Recipe, base: str) -> None:
         started_s = time.monotonic()
         old = built_image(recipe, self._engine)
-        labels = self._labels(recipe, base, old)
+        was = old.labels if old is not None else {}
+        parents = recipe.parents_on(base or None)
         if self._pull and not base:
-            self._pull_bases(recipe)
-        begin = {
-            parent.name: built_image(parent, self._engine).id  # type: ignore[union-attr]
-            for parent in recipe.parents_on(base or None)
-        }
+            names = {parent.name for parent in recipe.parents}
+            for image in images_in(recipe.dockerfile):
+                if bare_name(image) not in names and image != "scratch":
+                    self._progress.detail(f"{recipe.name}: pulling {image}")
+                    pulled(self._engine, image, newest=True)
+        begin = {parent.name: built_image(parent, self._engine) for parent in parents}
+        names_of_parents = {name: str(image.tags[0]) for name, image in begin.items() if image}
         if base and base not in begin:
-            begin[base] = str(pulled(self._engine, base, newest=self._pull).id)
-        labels[_FROM] = json.dumps(begin, sort_keys=True)
-        compared = (DIGEST, _BASE, _ARGUMENTS, _FROM)
-        is_as_wanted = old and all(old.labels.get(key) == labels[key] for key in compared)
-        if is_as_wanted and not self._pull:
-            self._progress.step(f"{recipe.name}: up to date, {_size(old)}")
-            return
-        steps = self._steps(recipe.name)
-        arguments = json.loads(labels[_ARGUMENTS])
-        if base:
-            arguments[BASE_ARGUMENT] = self._base(recipe, base, begin[base], steps)
-        text = on_images(recipe.dockerfile, begin)
-        made, python = steps.able(steps.build(recipe.folder, text, arguments))
-        steps.finish(made, recipe.tags, {**labels, **labels_of_python(python)})
-        self._forget(recipe, old)
-        self._report(f"{recipe.name}: built", started_s, self._engine.images.get(recipe.tags[0]))
-
-    def _labels(self, recipe: Recipe, base: str, old: Any | None) -> dict[str, str]:
-        """Labels that the image is to have; arguments of last time count again."""
-        wanted = old.labels if old is not None else {}
+            begin[base] = pulled(self._engine, base, newest=self._pull)
+        # Arguments of last time count again.
         known = arguments_of(recipe.dockerfile)
-        given = {key: value for key, value in self._arguments.items() if key in known}
-        arguments = json.loads(wanted.get(_ARGUMENTS, "{}")) | given
-        return {
+        arguments = json.loads(was.get(_ARGUMENTS, "{}"))
+        arguments |= {key: value for key, value in self._arguments.items() if key in known}
+        labels = {
             CONTAINER: recipe.name,
             FOLDER: str(recipe.folder),
             DIGEST: recipe.digest,
             _BASE: base,
             _ARGUMENTS: json.dumps(arguments, sort_keys=True),
+            _FROM: json.dumps({n: i.id for n, i in begin.items() if i}, sort_keys=True),
         }
-
-    def _base(self, recipe: Recipe, base: str, image: str, steps: BuildSteps) -> str:
-        """The image that the user wants to begin with.
-
-        In place of a recipe's image it must be able to do what that can: run nodes.
-        """
-        replaces_recipe = len(recipe.parents_on(base)) < len(recipe.parents)
-        return steps.able(image)[0] if replaces_recipe else image
-
-    def _pull_bases(self, recipe: Recipe) -> None:
-        parents = {parent.name for parent in recipe.parents}
-        for image in images_in(recipe.dockerfile):
-            if bare_name(image) not in parents and image != "scratch":
-                self._progress.detail(f"{recipe.name}: pulling {image}")
-                pulled(self._engine, image, newest=True)
+        compared = (DIGEST, _BASE, _ARGUMENTS, _FROM)
+        if old and not self._pull and all(was.get(key) == labels[key] for key in compared):
+            self._progress.step(f"{recipe.name}: up to date, {_size(old)}")
+            return
+        with self._builds(recipe.name) as builds:
+            if base:
+                arguments[BASE_ARGUMENT] = names_of_parents.get(base, base)
+                if len(parents) < len(recipe.parents):
+                    # In place of a recipe's image it has to do what that does: run nodes.
+                    arguments[BASE_ARGUMENT] = builds.able(arguments[BASE_ARGUMENT])[0]
+            text = on_images(recipe.dockerfile, names_of_parents)
+            made, python = builds.able(builds.build(recipe.folder, text, arguments))
+            builds.finish(made, recipe.tags, {**labels, **labels_of_python(python)})
+        self._forget(recipe, old)
+        took_s, new = time.monotonic() - started_s, self._engine.images.get(recipe.tags[0])
+        self._progress.step(f"{recipe.name}: built in {took_s:.1f} s, {_size(new)}")
 
     def _forget(self, recipe: Recipe, old: Any | None) -> None:
         """Remove what was built from this folder before, unless somebody uses it.
@@ -213,40 +355,19 @@ class ImageBuilder:
             with contextlib.suppress(APIError):
                 self._engine.images.remove(name)
 
-    def _report(self, text: str, started_s: float, image: Any | None = None) -> None:
-        size = f", {_size(image)}" if image is not None else ""
-        self._progress.step(f"{text} in {time.monotonic() - started_s:.1f} s{size}")
-
-
-def _require_use(bases: Mapping[str, str], recipes: Iterable[Recipe]) -> None:
-    """Raise ``UsageError`` where an image that is to be begun from would not be."""
-    by_name = {recipe.name: recipe for recipe in recipes}
-    for name, base in bases.items():
-        recipe = by_name.get(name)
-        if recipe is None:
-            names = ", ".join(sorted(by_name)) or "none"
-            raise UsageError(
-                f"--base-image {name}={base}: no container '{name}' is built here (there are:"
-                f" {names})"
-            )
-        if not recipe.takes(base):
-            raise UsageError(
-                f"--base-image {name}={base}: {recipe.folder}/Dockerfile does not begin from"
-                f" {BASE_ARGUMENT}: let it begin with 'ARG {BASE_ARGUMENT}=...' and"
-                f" 'FROM ${{{BASE_ARGUMENT}}}', or write the image into its FROM line"
-            )
-
 
 def _size(image: Any) -> str:
     return f"{image.attrs['Size'] / 1e6:.0f} MB"
 
 
-class BuildSteps:
+class _Builds:
     """The builds that one image takes, all with one log.
+
+    As a context manager it takes away the temporary names at the end.
 
     Args:
         name: of the image, for messages.
-        log: the file for what the engine says.
+        log: the file for what ``docker build`` prints.
     """
 
     def __init__(
@@ -254,49 +375,45 @@ class BuildSteps:
     ) -> None:
         self._engine, self._around, self._progress = engine, around, progress
         self._name, self._log = name, log
+        self._temporary: list[str] = []
+        self._environ = {**os.environ, "BUILDKIT_PROGRESS": "plain"}
+        with contextlib.suppress(EnvironmentFault):
+            # That of a rootless engine is none that the program would find by itself.
+            self._environ["DOCKER_HOST"] = f"unix://{engine_socket(engine)}"
         log.parent.mkdir(parents=True, exist_ok=True)
         log.unlink(missing_ok=True)
+
+    def __enter__(self) -> _Builds:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for name in self._temporary:
+            with contextlib.suppress(APIError):  # its build has failed, or it is in use
+                self._engine.images.remove(name, noprune=True)
 
     def build(
         self, folder: Path | None, dockerfile: str, arguments: Mapping[str, str] = _NOTHING
     ) -> str:
-        """Build from the files of ``folder``; returns the id of the image.
+        """Build from the files of ``folder``; returns a temporary name of the image.
+
+        It needs one: what BuildKit begins from has a name.
 
         Raises:
             EnvironmentFault: if it fails.
         """
-        found = needs_buildkit(dockerfile)
-        if found:
-            require_buildkit(self._engine, self._name, dockerfile, *found)
         if self._around.lines:
             dockerfile = after_each_from(dockerfile, self._around.lines)
-        given = {**self._around.arguments, **arguments}
-        settings = {"network_mode": self._around.network}
-        if not found:
-            archive = context_of(folder, dockerfile, self._around.files)
-            return self._run(archive, buildargs=given, **settings)
-        with named(self._engine, {**given, DOCKERFILE: dockerfile}) as texts:
-            archive = context_of(folder, texts.pop(DOCKERFILE), self._around.files)
-            with buildkit_messages(self._engine, archive, buildargs=texts, **settings) as messages:
-                return self._follow(messages)
-
-    def _run(self, archive: io.BytesIO, **settings: Any) -> str:
-        # The classic builder's API: each line of its output is a JSON object.
-        stream = self._engine.api.build(
-            fileobj=archive, custom_context=True, decode=True, rm=True, forcerm=True, **settings
-        )
-        return self._follow(stream)
-
-    def _follow(self, messages: Iterable[Mapping[str, Any]]) -> str:
-        log = BuildLog(self._log, lambda line: self._progress.detail(f"{self._name}: {line}"))
-        image = log.follow(messages)
-        if image is None:
-            for line in log.tail:
-                self._progress.step(f"  {line[:300]}")
-            raise EnvironmentFault(
-                f"image '{self._name}' cannot be built: {log.cause} (log: {self._log})"
-            )
-        return image
+        name = f"{_TEMPORARY}:{secrets.token_hex(6)}"
+        self._temporary.append(name)
+        options = ["--tag", name]
+        if self._around.network:
+            options += ["--network", self._around.network]
+        for key, value in {**self._around.arguments, **arguments}.items():
+            # Other users of this machine see the arguments of programs, but not the environment.
+            is_known = self._environ.get(key) == value
+            options += ["--build-arg", key if is_known else f"{key}={value}"]
+        self._run(options, dockerfile, folder, self._around.files)
+        return name
 
     def able(self, image: str) -> tuple[str, PythonInImage]:
         """The image itself if it can run nodes, else one with what it lacks on top of it.
@@ -313,13 +430,13 @@ class BuildSteps:
                 f"image '{self._name}' has no rclpy, and there is no folder containers/{BASE} to"
                 f" add it from: {install_command()}"
             )
-        added = {BASE_ARGUMENT: image, "CONSTRAINTS": ""}
-        made = self.build(base.folder, base.dockerfile, added)
+        made = self.build(base.folder, base.dockerfile, {BASE_ARGUMENT: image, "CONSTRAINTS": ""})
         python = python_in(self._engine, made, self._name)
         if not python.has_rclpy:
+            self._temporary.remove(made)
             raise EnvironmentFault(
                 f"image '{self._name}': rclpy was installed, but does not load; to see why, run"
-                f" docker run --rm --entrypoint {python.path} {made[7:19]} -c 'import rclpy'"
+                f" docker run --rm --entrypoint {python.path} {made} -c 'import rclpy'"
             )
         return made, python
 
@@ -329,10 +446,99 @@ class BuildSteps:
         if self._around.ca_bundle:
             user = self._engine.images.get(image).attrs["Config"].get("User") or "0"
             lines += ["USER 0", f"RUN rm -f {CERTIFICATES}", f"USER {user}"]
-        lines.append(label_line(labels))
-        made = self._run(context_of(None, "\n".join(lines)), tag=tags[0], network_mode="none")
-        for further in tags[1:]:
-            self._engine.images.get(made).tag(further)
+        options = ["--network", "none"]
+        for tag in tags:
+            options += ["--tag", tag]
+        for key, value in labels.items():
+            options += ["--label", f"{key}={value}"]
+        self._run(options, "\n".join(lines))
+
+    def _run(
+        self,
+        options: Sequence[str],
+        dockerfile: str,
+        folder: Path | None = None,
+        further: Mapping[str, bytes] = _NO_FILES,
+    ) -> None:
+        said: list[str] = []
+        with (
+            context_of(folder, dockerfile, further) as context,
+            self._log.open("a", encoding="utf-8") as log,
+            subprocess.Popen(
+                ["docker", "build", "--force-rm", *options, "-"],
+                stdin=context,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                env=self._environ,
+                encoding="utf-8",
+                errors="replace",
+            ) as program,
+        ):
+            assert program.stdout is not None
+            try:
+                for line in program.stdout:
+                    log.write(line)
+                    plain = _COLOURS.sub("", line).rstrip()
+                    if plain.strip():
+                        said.append(plain)
+                    if _SHOWN.match(plain):
+                        self._progress.detail(f"{self._name}: {plain.strip()}")
+            except BaseException:  # Ctrl+C, above all
+                program.terminate()
+                raise
+        if program.returncode:
+            for line in said[-_TAIL_LINES:]:
+                self._progress.step(f"  {line[:300]}")
+            raise EnvironmentFault(
+                f"image '{self._name}' cannot be built: {cause_of(said)} (log: {self._log})"
+            )
+
+
+@contextlib.contextmanager
+def context_of(
+    folder: Path | None, dockerfile: str, further: Mapping[str, bytes] = _NO_FILES
+) -> Iterator[IO[bytes]]:
+    """A tar archive with the files of ``folder``, the Dockerfile, and ``further`` files.
+
+    A link becomes the file that it leads to, which may be outside.
+    """
+
+    def anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:
+        """Make it readable by all, without its owner."""
+        entry.uid = entry.gid = 0
+        entry.uname = entry.gname = ""
+        entry.mode = 0o755 if entry.mode & 0o111 else 0o644
+        return entry
+
+    with tempfile.TemporaryFile() as archive:
+        # Not every docker can tell an archive from a Dockerfile, but if it is compressed.
+        with tarfile.open(fileobj=archive, mode="w:gz", compresslevel=1, dereference=True) as tar:
+            for file in files_of(folder) if folder else ():
+                if file.name != "Dockerfile" or file.parent != folder:
+                    tar.add(file, str(file.relative_to(folder or file)), filter=anonymous)
+            for name, content in {"Dockerfile": dockerfile.encode(), **further}.items():
+                entry = tarfile.TarInfo(name)
+                entry.size, entry.mode = len(content), 0o644
+                tar.addfile(entry, BytesIO(content))
+        archive.seek(0)
+        yield archive
+
+
+def cause_of(said: Sequence[str]) -> str:
+    """Why a build failed, in a sentence: what a user can do, else the error as it was printed.
+
+    Args:
+        said: the lines that ``docker build`` has printed, without colours.
+    """
+    last = list(said[-40:])
+    for pattern, sentence in _CAUSES:
+        for line in last:
+            if match := re.search(pattern, line, re.IGNORECASE):
+                names = [name for name in match.groupdict().values() if name]
+                return sentence.format(what=names[0] if names else "", said=line)
+    begin = max((at for at, line in enumerate(last) if _STEP.match(line)), default=0)
+    errors = (match[1] for line in last[begin:] if (match := _ERROR.match(line)))
+    return next(errors, last[-1] if last else "docker build does not say why")
 
 
 def pulled(engine: DockerClient, name: str, *, newest: bool) -> Any:

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shlex
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import takewhile
 from types import MappingProxyType
 
 _VARIABLE = re.compile(r"\$(?:\{(\w+)(?::-([^}]*))?\}|(\w+))")
 _HEREDOC = re.compile(r"(?:^|\s)\d*<<(-?)([\"']?)([A-Za-z_][\w.-]*)\2(?=[\s;|&)]|$)")
-_FLAG = re.compile(r"--(\w[\w-]*)")
+_WITH_HEREDOCS = ("RUN", "COPY", "ADD")
 _NOTHING: Mapping[str, str] = MappingProxyType({})
-
-# What only BuildKit understands of the instructions that the classic builder knows, too.
-_FLAGS_OF_BUILDKIT = {
-    "RUN": {"mount", "network", "security", "device"},
-    "COPY": {"link", "chmod", "parents", "exclude"},
-    "ADD": {"link", "chmod", "checksum", "keep-git-dir", "exclude", "unpack"},
-}
-_ARGUMENT_OF_BUILDKIT = re.compile(r"\b(?:TARGET|BUILD)(?:PLATFORM|OS|ARCH|VARIANT)\b")
 
 
 @dataclass(frozen=True)
@@ -32,31 +24,20 @@ class Instruction:
         text: what stands behind the name, on one line; without its heredocs.
         first: the number of its first line, from 1.
         last: the number of its last line, those of heredocs included.
-        heredocs: the names of its heredocs (``<<EOF``).
     """
 
     name: str
     text: str
     first: int
     last: int
-    heredocs: tuple[str, ...] = ()
-
-    @property
-    def flags(self) -> list[str]:
-        """The names of its options: those before everything else."""
-        names = []
-        for word in self.text.split():
-            match = _FLAG.match(word)
-            if match is None:
-                break
-            names.append(match[1])
-        return names
 
 
 def instructions(text: str) -> Iterator[Instruction]:
     """The instructions of a Dockerfile, in order."""
     lines = text.splitlines()
-    found = [re.match(r"#\s*escape\s*=\s*(\S)", line, re.IGNORECASE) for line in _directives(text)]
+    # Directives for the parser stand above everything else.
+    directives = takewhile(lambda line: re.match(r"#\s*\w+\s*=", line), lines)
+    found = (re.match(r"#\s*escape\s*=\s*(\S)", line, re.IGNORECASE) for line in directives)
     escape = next((match[1] for match in found if match), "\\")
     at = 0
     while at < len(lines):
@@ -72,15 +53,14 @@ def instructions(text: str) -> Iterator[Instruction]:
             parts.append(line[:-1].strip() if goes_on else line)
         name, _, rest = " ".join(parts).partition(" ")
         name, rest = name.upper(), rest.strip()
-        heredocs = _HEREDOC.findall(rest) if name in _FLAGS_OF_BUILDKIT else []
-        for strips, _quote, end in heredocs:
+        for strips, _quote, end in _HEREDOC.findall(rest) if name in _WITH_HEREDOCS else ():
             while at < len(lines):
                 line = lines[at].lstrip("\t") if strips else lines[at]
                 at += 1
                 if line == end:
                     break
         if name:
-            yield Instruction(name, rest, first + 1, at, tuple(each[2] for each in heredocs))
+            yield Instruction(name, rest, first + 1, at)
 
 
 def images_in(text: str, arguments: Mapping[str, str] = _NOTHING) -> list[str]:
@@ -114,24 +94,6 @@ def arguments_of(text: str) -> set[str]:
     }
 
 
-def needs_buildkit(text: str) -> tuple[Instruction, str] | None:
-    """The first instruction that the classic builder cannot do, and what of it; ``None``: none."""
-    for each in instructions(text):
-        further = _FLAGS_OF_BUILDKIT.get(each.name, set())
-        if each.heredocs:
-            return each, f"{each.name} <<{each.heredocs[0]}"
-        if flags := [flag for flag in each.flags if flag in further]:
-            return each, f"{each.name} --{flags[0]}"
-        if each.name in ("ARG", "FROM") and (match := _ARGUMENT_OF_BUILDKIT.search(each.text)):
-            return each, f"{each.name} {match[0]}"
-    return None
-
-
-def has_syntax_line(text: str) -> bool:
-    """Whether it names its own frontend (``# syntax=...``), which a registry has."""
-    return any(re.match(r"#\s*syntax\s*=", line, re.IGNORECASE) for line in _directives(text))
-
-
 def after_each_from(text: str, lines: str) -> str:
     """The Dockerfile with ``lines`` behind each ``FROM``: they count in all of its stages."""
     ends = {each.last for each in instructions(text) if each.name == "FROM"}
@@ -156,12 +118,6 @@ def on_images(text: str, tags: Mapping[str, str]) -> str:
     )
 
 
-def label_line(labels: Mapping[str, str]) -> str:
-    """The instruction that writes labels, all in one step."""
-    pairs = (f"{key}={json.dumps(value)}" for key, value in sorted(labels.items()))
-    return f"LABEL {' '.join(pairs)}".replace("$", "\\$")
-
-
 def _filled(text: str, values: Mapping[str, str]) -> str:
     return _VARIABLE.sub(lambda m: values.get(m[1] or m[3], "") or m[2] or "", text)
 
@@ -175,11 +131,3 @@ def _declared(instruction: Instruction) -> Iterator[tuple[str, str]]:
     for word in words:
         name, _, default = word.partition("=")
         yield name, default
-
-
-def _directives(text: str) -> Iterator[str]:
-    """The lines for the parser, which stand above everything else."""
-    for line in text.splitlines():
-        if not re.match(r"#\s*\w+\s*=", line):
-            return
-        yield line

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -81,6 +82,19 @@ class Abilities:
         return Abilities(
             of_podman or "name=rootless" in (facts.get("SecurityOptions") or ()),
             frozenset(k for k, fact in _LIMITS.items() if ignores_all or facts.get(fact) is False),
+        )
+
+
+def require_program() -> None:
+    """See to it that there is the program ``docker``, which the engine can do without.
+
+    Raises:
+        EnvironmentFault: if there is none, with the package that has it.
+    """
+    if shutil.which("docker") is None:
+        raise EnvironmentFault(
+            "there is no program docker here: sudo apt-get install docker.io (from Debian 13 on:"
+            " docker-cli)"
         )
 
 

@@ -32,6 +32,7 @@ from neuros.backends.docker.engine import (
     connect,
     engine_faults,
     engine_socket,
+    require_program,
 )
 from neuros.backends.docker.images import Image, image_for
 from neuros.backends.docker.settings import LIBRARY, MESSAGES, NETWORK_MODE, ROOT, limits
@@ -77,8 +78,7 @@ class RemoteEngine:
         self.reached_at = ""
         self._held = contextlib.ExitStack()
         try:
-            if shutil.which("docker") is None:
-                raise EnvironmentFault("there is no command docker here: apt-get install docker.io")
+            require_program()
             where = urlsplit(host.docker)
             self._address = self._tunnelled(ssh) if where.scheme == "ssh" else host.docker
             self.reached_at = self.reached_at or where.hostname or "127.0.0.1"
