@@ -1,10 +1,10 @@
-"""A project as files for Docker Compose, Docker Swarm or Kubernetes, which then start its nodes.
+"""A project as files for Docker Compose or Kubernetes, which then start its nodes.
 
 For Slurm it is a batch script (:func:`neuros.executors.slurm.slurm_script`).
 
 The folder that is written holds all that a run needs, but for the images that nodes run in::
 
-    compose.yaml, swarm.yaml or kubernetes.yaml
+    compose.yaml or kubernetes.yaml
     nodes.json         the node.json of every node: the configuration
     Dockerfile         puts the folder image/ on top of the image of a container
     image/             NeuROS, the project, its messages: what is /neuros in a container
@@ -199,7 +199,7 @@ class Export:
             file = self.folder / form.file
             documents = form.documents(self)
             text = yaml.dump_all(documents, Dumper=_Dumper, sort_keys=False, width=10_000)
-            file.write_text(form.head.format(name=self.name) + text, "utf-8")
+            file.write_text(form.head + text, "utf-8")
         return file
 
     def _check(self, form: Form) -> None:
@@ -332,7 +332,14 @@ def _compose(export: Export) -> list[dict[str, Any]]:
 def _compose_service(export: Export, part: Part) -> dict[str, Any]:
     resources, access = part.node.resources, part.node.access
     service: dict[str, Any] = {
-        **_service(part),
+        "image": part.image,
+        "build": {"context": ".", "args": {"BASE": part.base}},
+        "command": list(part.command),
+        "init": True,
+        "read_only": True,
+        "cap_drop": ["ALL"],
+        "stop_grace_period": f"{_stop_s(part)}s",
+        "healthcheck": {"test": ["CMD", *_is_up(part, "$$")], "interval": f"{_PROBE_S}s"},
         "restart": "no",
         "tmpfs": ["/tmp:exec,mode=1777"],
         # Who exports reads what nodes write, and may remove it.
@@ -357,55 +364,6 @@ def _compose_service(export: Export, part: Part) -> dict[str, Any]:
     return service
 
 
-def _swarm(export: Export) -> list[dict[str, Any]]:
-    is_host = export.options.host_network
-    network = {"name": "host", "external": True} if is_host else {"driver": "overlay"}
-    return [
-        {
-            "version": "3.8",
-            "services": {part.name: _swarm_service(export, part) for part in export.parts(str)},
-            "networks": {"nodes": network},
-            "volumes": {"runs": {}},
-            "configs": {"nodes": {"file": f"./{NODES_FILE}"}},
-        }
-    ]
-
-
-def _swarm_service(export: Export, part: Part) -> dict[str, Any]:
-    resources = part.node.resources
-    limits: dict[str, Any] = {}
-    if resources.cpus is not None:
-        limits["cpus"] = f"{resources.cpus:g}"
-    if resources.mem_bytes is not None:
-        limits["memory"] = memory_text(resources.mem_bytes)
-    deploy: dict[str, Any] = {"replicas": 1, "restart_policy": {"condition": "none"}}
-    if not export.options.host_network:
-        deploy["endpoint_mode"] = "dnsrr"  # the address of the container, not one before it
-    if limits:
-        deploy["resources"] = {"limits": limits}
-    return {
-        **_service(part),
-        "networks": ["nodes"],
-        "configs": [{"source": "nodes", "target": str(ROOT / NODES_FILE), "mode": 0o444}],
-        "volumes": [f"runs:{FOLDERS.run}", {"type": "tmpfs", "target": "/tmp"}],
-        "deploy": deploy,
-    }
-
-
-def _service(part: Part) -> dict[str, Any]:
-    """What a service of Compose and one of Swarm have in common."""
-    return {
-        "image": part.image,
-        "build": {"context": ".", "args": {"BASE": part.base}},
-        "command": list(part.command),
-        "init": True,
-        "read_only": True,
-        "cap_drop": ["ALL"],
-        "stop_grace_period": f"{_stop_s(part)}s",
-        "healthcheck": {"test": ["CMD", *_is_up(part, "$$")], "interval": f"{_PROBE_S}s"},
-    }
-
-
 def _stop_s(part: Part) -> int:
     """How long a container may take to end, in seconds; the orchestrator knows no progress."""
     return _STOP_S + math.ceil(part.node.finalise_s)
@@ -414,9 +372,8 @@ def _stop_s(part: Part) -> int:
 def _is_up(part: Part, dollar: str = "$") -> list[str]:
     """The command that succeeds while the launcher of a node listens to it, and before it does.
 
-    Swarm tells others the address of a healthy container only, and each waits for the others. The
-    run folder is an argument of the shell: RUN, which is part of it, may be any text. ``dollar``:
-    how the engine is told one that is not for itself.
+    The run folder is an argument of the shell: RUN, which is part of it, may be any text.
+    ``dollar``: how the engine is told one that is not for itself.
     """
     run = f'"{dollar}1"'
     return ["sh", "-c", f"test ! -e {run} || test -S {run}/control.sock", "sh", part.run]
@@ -527,13 +484,6 @@ FORMS: Mapping[str, Form] = {
         _compose,
         "# RUN=trial docker compose up --build; the run folders of its nodes are in runs/trial.\n",
         ("display",),
-    ),
-    "swarm": Form(
-        "swarm.yaml",
-        _swarm,
-        "# docker compose -f swarm.yaml build && docker compose -f swarm.yaml push;"
-        " docker stack deploy -c swarm.yaml {name}\n",
-        ("devices", "gpus", "display"),
     ),
     "kubernetes": Form(
         "kubernetes.yaml",

@@ -334,7 +334,7 @@ class LaunchOptions(Request):
     )
 
 
-FORMS = ("compose", "swarm", "kubernetes", "slurm")
+FORMS = ("compose", "kubernetes", "slurm")
 
 
 _LABEL = "[a-z0-9](?:[a-z0-9-]*[a-z0-9])?"
@@ -359,9 +359,7 @@ def _placed(text: str) -> tuple[str, int]:
 class ExportOptions(ProjectOptions):
     """How to export a project: for which engine, and how its nodes find each other there."""
 
-    form: str = option(
-        help="for which engine: compose, swarm, kubernetes or slurm", default="compose"
-    )
+    form: str = option(help="for which engine: compose, kubernetes or slurm", default="compose")
     output: str | os.PathLike[str] | None = like(
         Request,
         "output",

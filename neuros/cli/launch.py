@@ -283,9 +283,9 @@ _CODES_OF_SIGNALS = {2: 130, 15: 143, 1: 143}
 def add_export(export: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     export.description = (
-        "Write the files with which Docker Compose, Docker Swarm or Kubernetes start a project,"
-        " without NeuROS on their machines; each node gets a container. Or write a batch script"
-        " that launches the project on Slurm."
+        "Write the files with which Docker Compose or Kubernetes start a project, without NeuROS on"
+        " their machines; each node gets a container. Or write a batch script that launches the"
+        " project on Slurm."
     )
     export.add_argument("form", choices=FORMS, help="for which engine")
     add_project(export, ExportOptions)

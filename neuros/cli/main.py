@@ -67,7 +67,7 @@ COMMANDS = {
     "compare": Command("runs", "show the numbers of several runs side by side"),
     "bag": Command("runs", "show or complete what a run has recorded"),
     "replay": Command("replay", "run one node of a recorded run again, or publish recorded topics"),
-    "export": Command("launch", "write a project as files for Docker Compose, Swarm or Kubernetes"),
+    "export": Command("launch", "write a project as files for Docker Compose or Kubernetes"),
     "convert": Command("convert", "turn a robot or world in SDF or URDF into a MuJoCo model"),
     "doctor": Command("setup", "check this machine, and prove that packets arrive"),
     "containers": Command("setup", "build, list and remove the images that nodes run in"),

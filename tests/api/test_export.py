@@ -1,4 +1,4 @@
-"""``neuros export``: what the files for Compose, Swarm and Kubernetes say of a project."""
+"""``neuros export``: what the files for Compose and Kubernetes say of a project."""
 
 from __future__ import annotations
 
@@ -95,37 +95,29 @@ def services(project: Project, form: str, **options: Any) -> Mapping[str, Any]:
 def test_each_node_is_a_service_that_is_not_started_again_and_looks_for_the_others(
     project: Project,
 ) -> None:
-    for form in ("compose", "swarm"):
-        found = services(project, form, duration=3)
-        assert [*found] == ["the-thrower", "counter"]
-        command = " ".join(found["the-thrower"]["command"])
-        assert command.startswith("The_Thrower -d 0 ")
-        assert command.endswith(" --peer-timeout 600 --peers counter --duration 3")
-        assert "--peers the-thrower" in " ".join(found["counter"]["command"])
-        for service in found.values():
-            assert service["healthcheck"]["test"][-3].endswith("/control.sock")
-    assert found["counter"]["deploy"]["restart_policy"] == {"condition": "none"}
-
-
-def test_compose_does_not_start_a_node_again_either(project: Project) -> None:
-    assert {each["restart"] for each in services(project, "compose").values()} == {"no"}
+    found = services(project, "compose", duration=3)
+    assert [*found] == ["the-thrower", "counter"]
+    command = " ".join(found["the-thrower"]["command"])
+    assert command.startswith("The_Thrower -d 0 ")
+    assert command.endswith(" --peer-timeout 600 --peers counter --duration 3")
+    assert "--peers the-thrower" in " ".join(found["counter"]["command"])
+    for service in found.values():
+        assert service["healthcheck"]["test"][-3].endswith("/control.sock")
+        assert service["restart"] == "no"
 
 
 def test_limits_of_a_node_are_those_of_its_container(project: Project) -> None:
     thrower = services(project, "compose")["the-thrower"]
     assert (thrower["mem_limit"], thrower["cpus"], thrower["pids_limit"]) == ("512m", 1.5, 64)
     assert thrower["memswap_limit"] == thrower["mem_limit"]
-    limits = services(project, "swarm")["the-thrower"]["deploy"]["resources"]["limits"]
-    assert limits == {"cpus": "1.5", "memory": "512m"}
     *_, job, _ = exported(project, "kubernetes")
     (container,) = job["spec"]["template"]["spec"]["containers"]
     assert container["resources"]["limits"] == {"cpu": "1.5", "memory": str(512 << 20)}
 
 
 def test_a_node_gets_no_right_that_it_has_no_need_of(project: Project) -> None:
-    for form in ("compose", "swarm"):
-        for service in services(project, form).values():
-            assert (service["cap_drop"], service["read_only"]) == (["ALL"], True)
+    for service in services(project, "compose").values():
+        assert (service["cap_drop"], service["read_only"]) == (["ALL"], True)
 
 
 @pytest.mark.parametrize("version", [OLDEST_KUBERNETES, NEWEST_KUBERNETES])
@@ -169,7 +161,8 @@ def test_the_folder_holds_all_that_images_get_and_nothing_of_earlier_runs(
 def test_the_name_of_an_image_changes_with_what_is_in_it(tmp_path: Path) -> None:
     project = project_in(tmp_path)
     before = services(project, "compose")["counter"]["image"]
-    assert services(project, "swarm")["counter"]["image"] == before
+    same = export(project, (), ExportOptions(form="compose", output=tmp_path / "same"))
+    assert yaml.safe_load(same.read_text("utf-8"))["services"]["counter"]["image"] == before
     (project.folder / "table.txt").write_text("4 5 6")
     again = export(project, (), ExportOptions(form="compose", output=tmp_path / "again"))
     assert yaml.safe_load(again.read_text("utf-8"))["services"]["counter"]["image"] != before
@@ -212,8 +205,8 @@ def test_every_node_survives_the_way_through_the_file(project: Project, tmp_path
 @pytest.mark.parametrize(
     ("form", "wish", "named"),
     [
-        ("swarm", {"devices": ["/dev/null"]}, "asks for devices, and swarm has none"),
-        ("swarm", {"gpus": "all"}, "asks for gpus, and swarm has none"),
+        ("compose", {"display": True}, "asks for display, and compose has none"),
+        ("kubernetes", {"devices": ["/dev/null"]}, "asks for devices, and kubernetes has none"),
         ("kubernetes", {"display": True}, "asks for display, and kubernetes has none"),
     ],
 )
@@ -234,10 +227,9 @@ def test_devices_and_gpus_go_into_the_compose_file(tmp_path: Path) -> None:
 
 
 def test_a_machine_s_own_network_takes_no_names_of_containers(project: Project) -> None:
-    assert services(project, "compose", host_network=True)["counter"]["network_mode"] == "host"
-    (document,) = exported(project, "swarm", host_network=True, peers="10.0.0.7")
-    assert document["networks"] == {"nodes": {"name": "host", "external": True}}
-    assert "--peers 10.0.0.7" in " ".join(document["services"]["counter"]["command"])
+    counter = services(project, "compose", host_network=True, peers="10.0.0.7")["counter"]
+    assert counter["network_mode"] == "host"
+    assert "--peers 10.0.0.7" in " ".join(counter["command"])
     with pytest.raises(UsageError, match="--host-network: Kubernetes gives each pod an address"):
         exported(project, "kubernetes", host_network=True)
 
@@ -344,18 +336,17 @@ def test_a_failed_export_leaves_nothing_behind(
 
 def test_the_run_folder_may_have_any_name(project: Project) -> None:
     """As ``RUN`` is the user's, it is no part of what the shell reads."""
-    for form in ("compose", "swarm"):
-        _, shell, option, script, *arguments = services(project, form)["counter"]["healthcheck"][
-            "test"
-        ]
-        assert "RUN" not in script
-        assert "$$1" in script  # Compose and Swarm make $ of it
-        assert "${RUN:-run}" in arguments[-1]
-        made = project.folder / "a run; exit 7" / "counter"
-        made.mkdir(parents=True, exist_ok=True)
-        command = [shell, option, script.replace("$$", "$"), "sh", str(made)]
-        assert subprocess.run(command, check=False).returncode == 1  # nothing listens in there
-        assert subprocess.run([*command[:-1], f"{made} gone"], check=False).returncode == 0
+    _, shell, option, script, *arguments = services(project, "compose")["counter"]["healthcheck"][
+        "test"
+    ]
+    assert "RUN" not in script
+    assert "$$1" in script  # Compose makes $ of it
+    assert "${RUN:-run}" in arguments[-1]
+    made = project.folder / "a run; exit 7" / "counter"
+    made.mkdir(parents=True)
+    command = [shell, option, script.replace("$$", "$"), "sh", str(made)]
+    assert subprocess.run(command, check=False).returncode == 1  # nothing listens in there
+    assert subprocess.run([*command[:-1], f"{made} gone"], check=False).returncode == 0
 
 
 def test_names_that_kubernetes_refuses_are_told_at_once(project: Project) -> None:

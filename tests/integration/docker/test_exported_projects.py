@@ -12,9 +12,7 @@ from typing import Any
 
 import pytest
 import yaml
-from engines import own_engine, require_engines
 from launching import Finished, launch
-from machines import Machine
 from needs import require
 
 from containers import connected, require_containers, wait_until
@@ -208,35 +206,3 @@ def has_played(project: Composed, node: str) -> bool:
     """Whether packets have come, as the list shows that a node writes once per second."""
     lists = (project.runs / node / node / "packets").glob("*.taken")
     return any(each.stat().st_size for each in lists)
-
-
-def test_a_run_by_a_swarm_carries_the_packets_of_a_local_one(
-    reference: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    require("ip", "docker", "docker-compose")
-    require_engines()
-    folder = tmp_path / "exported"
-    assert main(["export", "swarm", str(tmp_path / "rally"), "-o", str(folder)]) == 0
-    machine = Machine("swarm", is_apart=True)
-    try:
-        machine.run("ip", "link", "set", "lo", "up")
-        with own_engine(machine) as engine:
-            address = {"DOCKER_HOST": engine.address}
-            run(["docker", "swarm", "init", "--advertise-addr", "127.0.0.1"], folder, **address)
-            run(["docker-compose", "-f", "swarm.yaml", "build"], folder, **address)
-            deploy = ["docker", "stack", "deploy", "--resolve-image", "never", "-c", "swarm.yaml"]
-            run([*deploy, "rally"], folder, **address)
-
-            def are_complete() -> bool:
-                form = ["--format", "{{.CurrentState}}"]
-                states = run(["docker", "stack", "ps", *form, "rally"], folder, **address)
-                assert "Failed" not in states, states
-                return states.count("Complete") == len(PLAYERS)
-
-            wait_until(are_complete, FOUND_S)
-            runs = engine.data / "volumes/rally_runs/_data/trial"
-            assert reference.run_folder is not None
-            assert_identical(reference.run_folder, runs, capsys)
-            run(["docker", "stack", "rm", "rally"], folder, **address)
-    finally:
-        machine.close()
