@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,10 @@ from neuros.backends.docker.images import Image
 from neuros.backends.docker.launcher import how_it_ended
 from neuros.backends.docker.settings import (
     DDS_SETTINGS,
-    User,
     as_here,
     container_settings,
     inside,
     outside,
-    user_for,
 )
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
@@ -38,10 +38,13 @@ def node_file(**keys: Any) -> NodeFile:
 
 
 def settings(
-    file: NodeFile, user: User | None = None, cores: tuple[int, ...] = (), **options: Any
+    file: NodeFile,
+    environ: Mapping[str, str] | None = None,
+    cores: tuple[int, ...] = (),
+    **options: Any,
 ) -> dict[str, Any]:
-    program = NodeProgram(cores={"snn": cores})
-    return container_settings(file, IMAGE, user or User(1000, 1001), program, RUN, **options)
+    program = NodeProgram(cores={"snn": cores}, environ=environ or {})
+    return container_settings(file, IMAGE, program, RUN, **options)
 
 
 def mounts(found: dict[str, Any]) -> dict[str, tuple[str, bool]]:
@@ -52,7 +55,7 @@ def mounts(found: dict[str, Any]) -> dict[str, tuple[str, bool]]:
 def test_by_default_it_may_nothing_and_sees_only_its_run() -> None:
     found = settings(node_file())
     assert found["image"] == "sha256:1234"
-    assert found["user"] == "1000:1001"
+    assert found["user"] == f"{os.getuid()}:{os.getgid()}"
     assert found["cap_drop"] == ["ALL"]
     assert found["security_opt"] == ["no-new-privileges"]
     assert {found[key] for key in ("read_only", "init", "auto_remove")} == {True}
@@ -80,7 +83,7 @@ def test_what_others_have_in_the_run_folder_can_only_be_read() -> None:
 
 
 def test_with_a_rootless_engine_its_user_is_root_inside_and_has_no_more_rights() -> None:
-    found = settings(node_file(), user_for(node_file(), {}, is_rootless=True))
+    found = settings(node_file(access=Access(devices=("/dev/null",))), is_rootless=True)
     assert (found["user"], found["group_add"]) == ("0:0", [])
     assert found["cap_drop"] == ["ALL"]
 
@@ -110,27 +113,38 @@ def test_limits_and_cores_are_passed_on() -> None:
     ("gpus", "request_"),
     [(("all",), {"count": -1}), (("0", "GPU-3a"), {"device_ids": ["0", "GPU-3a"]})],
 )
-def test_gpus_and_devices_are_requested(gpus: tuple[str, ...], request_: dict[str, Any]) -> None:
-    file = node_file(access=Access(devices=("/dev/ttyUSB0",), gpus=gpus))
-    found = settings(file, User(1000, 1001, groups=(20,)))
+def test_gpus_and_devices_are_requested(
+    gpus: tuple[str, ...], request_: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owner = os.stat("/dev/null").st_gid
+    monkeypatch.setattr("os.getgroups", lambda: [owner, owner + 1])
+    file = node_file(access=Access(devices=("/dev/null",), gpus=gpus))
+    found = settings(file)
     assert found["device_requests"] == [{**request_, "capabilities": [["gpu"]]}]
-    assert found["devices"] == ["/dev/ttyUSB0:/dev/ttyUSB0:rw"]
-    assert found["group_add"] == ["20"], "the group that owns the device"
+    assert found["devices"] == ["/dev/null:/dev/null:rw"]
+    assert found["group_add"] == [str(owner)], "the group that owns the device"
+
+
+def test_a_device_that_is_not_there_is_named() -> None:
+    file = node_file(access=Access(devices=("/dev/none",)))
+    with pytest.raises(EnvironmentFault, match="node 'snn' asks for the device /dev/none: No such"):
+        settings(file)
 
 
 def test_the_display_is_open_to_those_alone_that_ask_for_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("neuros.backends.docker.settings.X11", tmp_path)
-    environ = {"DISPLAY": ":1", "NEUROS_GUI": "1"}
-    user = User(1000, 1001, environ=environ, xauthority=Path("/home/me/.Xauthority"))
+    key = tmp_path / ".Xauthority"
+    key.touch()
+    user = {"DISPLAY": ":1", "NEUROS_GUI": "1", "HOME": str(tmp_path)}
     closed = settings(node_file(), user)
     assert not {"DISPLAY", "NEUROS_GUI", "XAUTHORITY"} & set(closed["environment"])
     found = settings(node_file(access=Access(display=True)), user)
     assert found["environment"]["DISPLAY"] == ":1"
     assert found["environment"]["NEUROS_GUI"] == "1"
     assert found["environment"]["XAUTHORITY"] == "/neuros/xauthority"
-    assert mounts(found)["/neuros/xauthority"] == ("/home/me/.Xauthority", True)
+    assert mounts(found)["/neuros/xauthority"] == (str(key), True)
     assert mounts(found)[str(tmp_path)] == (str(tmp_path), True)
 
 
@@ -138,7 +152,7 @@ def test_a_display_over_the_network_comes_without_a_socket(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("neuros.backends.docker.settings.X11", tmp_path / "none")
-    user = User(1000, 1001, environ={"DISPLAY": "localhost:10.0"})
+    user = {"DISPLAY": "localhost:10.0"}
     found = settings(node_file(access=Access(display=True)), user)
     assert found["environment"]["DISPLAY"] == "localhost:10.0"
     assert str(tmp_path / "none") not in mounts(found)
@@ -146,18 +160,17 @@ def test_a_display_over_the_network_comes_without_a_socket(
 
 def test_settings_of_dds_of_the_users_own_are_passed_on(tmp_path: Path) -> None:
     (tmp_path / "dds.xml").touch()
-    user = user_for(node_file(), {DDS_SETTINGS: str(tmp_path / "dds.xml")})
-    found = settings(node_file(), user)
+    found = settings(node_file(), {DDS_SETTINGS: str(tmp_path / "dds.xml")})
     assert found["environment"][DDS_SETTINGS] == "/neuros/fast_dds.xml"
     assert mounts(found)["/neuros/fast_dds.xml"] == (str(tmp_path / "dds.xml"), True)
     with pytest.raises(EnvironmentFault, match="there is no such file"):
-        user_for(node_file(), {DDS_SETTINGS: str(tmp_path / "none.xml")})
+        settings(node_file(), {DDS_SETTINGS: str(tmp_path / "none.xml")})
 
 
 def test_the_environment_is_that_of_the_node_and_little_of_the_users() -> None:
     environ = {"TOKEN": "secret", "LANG": "C.UTF-8", "OMP_NUM_THREADS": "2", "TZ": "UTC"}
     file = node_file(environment={"RATE": "50", "TZ": "CET"})
-    found = settings(file, User(1000, 1001, environ=environ))["environment"]
+    found = settings(file, environ)["environment"]
     assert found["RATE"] == "50"
     assert found["LANG"] == "C.UTF-8"
     assert found["OMP_NUM_THREADS"] == "2"

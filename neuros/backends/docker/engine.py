@@ -43,14 +43,36 @@ def connect(
     given = dict(environ)
     where = given.get("DOCKER_HOST", "")
     try:
-        where = where or _address_of_context(given)
+        if not where:  # `docker context use` may have chosen one
+            address = ContextAPI.kwargs_from_context(environment=given).get("base_url", "")
+            where = str(address).removeprefix("http+")
         if where in ("", _USUAL_ADDRESS):
-            where = given["DOCKER_HOST"] = _usual_address(given)
-        _try_socket(where)
+            folder = given.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
+            rootless = Path(folder) / "docker.sock"
+            is_rootless = rootless.is_socket() and not _USUAL_SOCKET.exists()
+            where = given["DOCKER_HOST"] = f"unix://{rootless if is_rootless else _USUAL_SOCKET}"
+        scheme, _, path = where.partition("://")
+        if scheme == "unix":  # the operating system's own error says more than the SDK's
+            with socket.socket(socket.AF_UNIX) as tried:
+                tried.connect(path)
         # "auto" asks the engine, so that whatever else is wrong shows here.
         engine = docker.from_env(version="auto", timeout=timeout_s, environment=given)
     except (DockerException, requests.RequestException, OSError, ValueError) as error:
-        raise EnvironmentFault(_explain(error, where)) from error
+        cause = _cause(error)
+        if isinstance(cause, PermissionError):
+            why = (
+                f"this user may not use the Docker engine at {where}: sudo usermod -aG docker"
+                f" {os.environ.get('USER', '$USER')}, then log in again (or install rootless"
+                " Docker)"
+            )
+        elif cause is not None:
+            why = (
+                f"no Docker engine answers at {where} ({cause.strerror or cause}): install and"
+                " start it (sudo apt-get install docker.io; sudo systemctl start docker)"
+            )
+        else:
+            why = f"the Docker engine at {where} cannot be used ({error}): see DOCKER_HOST"
+        raise EnvironmentFault(f"{why}, {OR_WITHOUT}") from error
     found = tuple(map(int, str(engine.api.api_version).split(".")))
     if found < OLDEST_API:
         engine.close()
@@ -144,43 +166,6 @@ def explain(text: str) -> str:
     if "could not select device driver" in said and "gpu" in said:
         return "the engine cannot give it a GPU: install the NVIDIA Container Toolkit"
     return said
-
-
-def _usual_address(environ: Mapping[str, str]) -> str:
-    folder = environ.get("XDG_RUNTIME_DIR") or f"/run/user/{os.getuid()}"
-    rootless = Path(folder) / "docker.sock"
-    is_rootless = rootless.is_socket() and not _USUAL_SOCKET.exists()
-    return f"unix://{rootless if is_rootless else _USUAL_SOCKET}"
-
-
-def _address_of_context(environ: Mapping[str, str]) -> str:
-    """The address that ``docker context use`` has chosen, or ""."""
-    address = ContextAPI.kwargs_from_context(environment=environ).get("base_url", "")
-    return str(address).removeprefix("http+")
-
-
-def _try_socket(address: str) -> None:
-    """Raise the operating system's own error where a socket cannot be used."""
-    scheme, _, path = address.partition("://")
-    if scheme == "unix":
-        with socket.socket(socket.AF_UNIX) as tried:
-            tried.connect(path)
-
-
-def _explain(error: BaseException, where: str) -> str:
-    cause = _cause(error)
-    if isinstance(cause, PermissionError):
-        return (
-            f"this user may not use the Docker engine at {where}: sudo usermod -aG docker"
-            f" {os.environ.get('USER', '$USER')}, then log in again (or install rootless Docker),"
-            f" {OR_WITHOUT}"
-        )
-    if isinstance(cause, OSError):
-        return (
-            f"no Docker engine answers at {where} ({cause.strerror or cause}): install and start"
-            f" it (sudo apt-get install docker.io; sudo systemctl start docker), {OR_WITHOUT}"
-        )
-    return f"the Docker engine at {where} cannot be used ({error}): see DOCKER_HOST, {OR_WITHOUT}"
 
 
 def _cause(error: BaseException) -> OSError | None:

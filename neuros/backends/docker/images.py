@@ -5,6 +5,7 @@ Whether the Python of an image runs nodes is found out by running the image once
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -111,7 +112,18 @@ def image_for(container: str, project_folder: Path | None, engine: DockerClient)
     with engine_faults(f"container '{container}'"):
         if recipe is None:
             return _given(container, engine)
-        return _built(recipe, project_folder, engine)
+        image = built_image(recipe, engine)
+    to_build: Path | str = recipe.name
+    if project_folder is not None and recipe.folder.is_relative_to(project_folder):
+        has_file = (project_folder / "project.json").is_file()  # a project can do without
+        to_build = project_folder if has_file else recipe.folder
+    remedy = f"run {build_command(to_build)}"
+    if image is None:
+        raise EnvironmentFault(f"the image of container '{recipe.name}' is not built: {remedy}")
+    notice = ""
+    if not is_current(image, recipe):
+        notice = f"the image of container '{recipe.name}' is older than its recipe: {remedy}"
+    return _labelled(image, recipe.tags[0], notice)
 
 
 def built_image(recipe: Recipe, engine: DockerClient) -> Any | None:
@@ -122,9 +134,11 @@ def built_image(recipe: Recipe, engine: DockerClient) -> Any | None:
         if image.labels.get(CONTAINER) == recipe.name
         and (is_current(image, recipe) or image.labels.get(FOLDER) == str(recipe.folder))
     ]
-    newest_last = sorted(images, key=lambda image: str(image.attrs.get("Created", "")))
-    current = [image for image in newest_last if is_current(image, recipe)]
-    return (current or newest_last or [None])[-1]
+
+    def age(image: Any) -> tuple[bool, str]:
+        return is_current(image, recipe), str(image.attrs.get("Created", ""))
+
+    return max(images, key=age, default=None)
 
 
 def is_current(image: Any, recipe: Recipe) -> bool:
@@ -140,24 +154,6 @@ def labels_of_python(python: PythonInImage) -> dict[str, str]:
 def added_tag(image: Any) -> str:
     """The name of what is built on an image of a user's that lacks rclpy."""
     return f"{ADDED}:{str(image.id).removeprefix('sha256:')[:12]}"
-
-
-def _built(recipe: Recipe, project_folder: Path | None, engine: DockerClient) -> Image:
-    image = built_image(recipe, engine)
-    remedy = f"run {build_command(_to_build(recipe, project_folder))}"
-    if image is None:
-        raise EnvironmentFault(f"the image of container '{recipe.name}' is not built: {remedy}")
-    notice = ""
-    if not is_current(image, recipe):
-        notice = f"the image of container '{recipe.name}' is older than its recipe: {remedy}"
-    return _labelled(image, recipe.tags[0], notice)
-
-
-def _to_build(recipe: Recipe, project_folder: Path | None) -> Path | str:
-    """The argument that builds an image; a project can do without a ``project.json``."""
-    if project_folder is None or not recipe.folder.is_relative_to(project_folder):
-        return recipe.name
-    return project_folder if (project_folder / "project.json").is_file() else recipe.folder
 
 
 def _labelled(image: Any, name: str, notice: str = "") -> Image:
@@ -181,14 +177,12 @@ def _given(container: str, engine: DockerClient) -> Image:
         )
     if START in image.labels:
         return _labelled(image, container)
-    try:
+    with contextlib.suppress(ImageNotFound):
         return _labelled(engine.images.get(added_tag(image)), container)
-    except ImageNotFound:
-        pass
     python = python_in(engine, image.id, container)
     if not python.has_rclpy:
         raise EnvironmentFault(
-            f"image '{container}' has Python {'{}.{}'.format(*python.version)} without rclpy, which"
+            f"image '{container}' has Python {dotted(python.version)} without rclpy, which"
             f" {BASE} has: to have it added, run {build_command(container)}"
         )
     return Image(image.id, container, python.start, python.version)
@@ -221,8 +215,33 @@ def inventory(engine: DockerClient) -> list[BuiltImage]:
     Raises:
         EnvironmentFault: if the engine does not answer.
     """
+    found = []
     with engine_faults("the images cannot be listed"):
-        found = [*_found(engine)]
+        images = engine.images.list(filters={"label": CONTAINER})
+    for image in images:
+        labels = image.labels
+        container, folder = labels[CONTAINER], labels.get(FOLDER)
+        # Labels are inherited: an image that the user built on one of ours has other names.
+        tags = [tag for tag in image.tags if tag.rpartition(":")[0] in (container, ADDED)]
+        if not tags:
+            continue
+        is_still = True
+        if folder:
+            try:
+                recipe = find_recipe(container, Path(folder).parent.parent)
+                is_still = recipe is not None and is_current(image, recipe)
+            except EnvironmentFault:
+                is_still = False
+        found.append(
+            BuiltImage(
+                container=container,
+                tags=tuple(sorted(tags)),
+                size_bytes=int(image.attrs["Size"]),
+                python=labels.get(PYTHON, "?"),
+                folder=Path(folder) if folder else None,
+                is_current=is_still,
+            )
+        )
     return sorted(found, key=lambda image: (image.container, image.tags))
 
 
@@ -247,35 +266,6 @@ def remove_images(engine: DockerClient, containers: Collection[str]) -> Iterator
                 with engine_faults(f"{tag} cannot be removed"):
                     engine.images.remove(tag)
                 yield tag
-
-
-def _found(engine: DockerClient) -> Iterator[BuiltImage]:
-    for image in engine.images.list(filters={"label": CONTAINER}):
-        labels = image.labels
-        container = labels[CONTAINER]
-        # Labels are inherited: an image that the user built on one of ours has other names.
-        tags = [tag for tag in image.tags if tag.rpartition(":")[0] in (container, ADDED)]
-        if tags:
-            folder = Path(labels[FOLDER]) if labels.get(FOLDER) else None
-            yield BuiltImage(
-                container=container,
-                tags=tuple(sorted(tags)),
-                size_bytes=int(image.attrs["Size"]),
-                python=labels.get(PYTHON, "?"),
-                folder=folder,
-                is_current=_digest_now(container, folder) in (None, labels.get(DIGEST)),
-            )
-
-
-def _digest_now(container: str, folder: Path | None) -> str | None:
-    """The digest of the recipe as it is now, ``None`` where there is none to compare with."""
-    if folder is None:
-        return None
-    try:
-        recipe = find_recipe(container, folder.parent.parent)
-    except EnvironmentFault:
-        return ""
-    return recipe.digest if recipe else ""
 
 
 @dataclass(frozen=True)
@@ -303,14 +293,47 @@ class PythonInImage:
 
 
 def python_in(engine: DockerClient, image: str, name: str) -> PythonInImage:
-    """Look into an image; ``name`` is for messages.
+    """Look into an image, by a container that is removed afterwards; ``name`` is for messages.
 
     Raises:
         EnvironmentFault: if it has no Python that could ever run nodes.
     """
+    output = ""
     with engine_faults(f"image '{name}' cannot be looked into"):
-        output = _output(engine, image, name)
-    return chosen(_facts(output), name)
+        try:
+            container = engine.containers.create(
+                image,
+                entrypoint=["/bin/sh", "-c", _PROBE],
+                command=[],
+                environment={
+                    "PROOF": _PROOF,
+                    "FACTS": _FACTS,
+                    "ROS_LOG_DIR": "/tmp",
+                    "HOME": "/tmp",
+                },
+                labels={"neuros.probe": "1"},
+                network_mode="none",
+                user="65534:65534",
+                cap_drop=["ALL"],
+                security_opt=["no-new-privileges"],
+            )
+        except NotFound:
+            raise EnvironmentFault(f"there is no image '{name}'") from None
+        try:
+            container.start()
+            container.wait(timeout=_PROBE_TIMEOUT_S)
+            output = container.logs(stdout=True, stderr=False).decode(errors="replace")
+        except APIError as error:
+            # An image without a shell has no Python to speak of.
+            if "no such file" not in str(error).lower():
+                raise
+        finally:
+            container.remove(force=True, v=True)
+    answers = []
+    for line in output.splitlines():
+        with contextlib.suppress(ValueError):  # a ROS distribution prints while it is sourced
+            answers.append(json.loads(line))
+    return chosen([each for each in answers if isinstance(each, dict)], name)
 
 
 def chosen(answers: Sequence[Mapping[str, Any]], name: str) -> PythonInImage:
@@ -319,69 +342,24 @@ def chosen(answers: Sequence[Mapping[str, Any]], name: str) -> PythonInImage:
     Raises:
         EnvironmentFault: if there is none that could ever run nodes.
     """
+    supported = f"{dotted(OLDEST)} to {dotted(NEWEST)}"
     if not answers:
         raise EnvironmentFault(
-            f"image '{name}' has no Python: take one with Python"
-            f" {dotted(OLDEST)} to {dotted(NEWEST)}, as python:3.12-slim"
+            f"image '{name}' has no Python: take one with Python {supported}, as python:3.12-slim"
         )
     answer = next((each for each in answers if each["has_rclpy"]), answers[0])
-    major, minor = answer["version"]
-    found = PythonInImage(answer["python"], (major, minor), answer["has_rclpy"], answer["setup"])
-    if not found.has_rclpy:
-        _refuse(found, answer, name)
-    return found
-
-
-def _refuse(found: PythonInImage, answer: Mapping[str, Any], name: str) -> None:
-    """There are no wheels of rclpy for everything."""
-    version = found.version
+    major, minor = version = answer["version"]
+    # There are no wheels of rclpy for everything.
+    wrong = remedy = ""
     if not answer["glibc"]:
-        why, remedy = "another C library than glibc", "Debian or Ubuntu, as python:3.12-slim"
+        wrong, remedy = "another C library than glibc", "Debian or Ubuntu, as python:3.12-slim"
     elif answer["machine"] != "x86_64":
-        why, remedy = f"a processor of the kind {answer['machine']}", "x86_64"
-    elif not OLDEST <= version <= NEWEST:
-        why, remedy = f"Python {dotted(version)}", f"Python {dotted(OLDEST)} to {dotted(NEWEST)}"
-    else:
-        return
-    raise EnvironmentFault(
-        f"image '{name}' has {why}, for which there is no package of rclpy: take an image with"
-        f" {remedy}, or one with a ROS distribution"
-    )
-
-
-def _output(engine: DockerClient, image: str, name: str) -> str:
-    """Output of the probe, in a container that is removed afterwards."""
-    try:
-        container = engine.containers.create(
-            image,
-            entrypoint=["/bin/sh", "-c", _PROBE],
-            command=[],
-            environment={"PROOF": _PROOF, "FACTS": _FACTS, "ROS_LOG_DIR": "/tmp", "HOME": "/tmp"},
-            labels={"neuros.probe": "1"},
-            network_mode="none",
-            user="65534:65534",
-            cap_drop=["ALL"],
-            security_opt=["no-new-privileges"],
+        wrong, remedy = f"a processor of the kind {answer['machine']}", "x86_64"
+    elif not OLDEST <= (major, minor) <= NEWEST:
+        wrong, remedy = f"Python {dotted(version)}", f"Python {supported}"
+    if wrong and not answer["has_rclpy"]:
+        raise EnvironmentFault(
+            f"image '{name}' has {wrong}, for which there is no package of rclpy: take an image"
+            f" with {remedy}, or one with a ROS distribution"
         )
-    except NotFound:
-        raise EnvironmentFault(f"there is no image '{name}'") from None
-    try:
-        container.start()
-        container.wait(timeout=_PROBE_TIMEOUT_S)
-        return str(container.logs(stdout=True, stderr=False).decode(errors="replace"))
-    except APIError as error:
-        if "no such file" in str(error).lower():  # it has no shell, so it has no Python to speak of
-            return ""
-        raise
-    finally:
-        container.remove(force=True, v=True)
-
-
-def _facts(output: str) -> list[dict[str, Any]]:
-    found = []
-    for line in output.splitlines():
-        try:
-            found.append(json.loads(line))
-        except ValueError:  # what a ROS distribution prints while it is sourced
-            continue
-    return [each for each in found if isinstance(each, dict)]
+    return PythonInImage(answer["python"], (major, minor), answer["has_rclpy"], answer["setup"])

@@ -26,7 +26,7 @@ from neuros.backends.docker.engine import (
     engine_name,
     engine_socket,
 )
-from neuros.backends.docker.images import Image, images_for
+from neuros.backends.docker.images import images_for
 from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.docker.settings import (
     NETWORK_MODE,
@@ -38,7 +38,6 @@ from neuros.backends.docker.settings import (
     inside,
     mount,
     shared_memory,
-    user_for,
 )
 from neuros.backends.node_command import (
     last_line,
@@ -159,30 +158,33 @@ class DockerLauncher:
         with engine_faults("the engine's events cannot be listened to"):
             events = ContainerEvents(self._engine, run_id)
         events.start()
-        in_run_folder = _in_run_folder(nodes)
+        # Entries of the run folder that not all nodes may write to.
+        entries = sorted(nodes[0].folders.run.iterdir())
+        others = [path for path in entries if path.is_dir() or path.name == PROJECT_FILE]
+        networks = [NETWORK_MODE] * len(nodes)
+        if self._program.is_isolated:  # the run has a network of its own, that of its first node
+            first = container_name(nodes[0], run_id)
+            networks = [NO_NETWORK, *[f"container:{first}"] * (len(nodes) - 1)]
 
         def start(file: NodeFile, network: str) -> RunningContainer:
-            name = file.node.name
             settings = container_settings(
                 file,
-                self._image(file),
-                user_for(
-                    file, self._program.environ, is_rootless=self._containers.abilities.is_rootless
-                ),
+                self._containers.images[file.node.container],
                 self._program,
                 environment,
-                others=[path for path in in_run_folder if path != node_folder(file)],
+                others=[path for path in others if path != node_folder(file)],
                 launcher_pid=os.getpid(),
                 network=network,
+                is_rootless=self._containers.abilities.is_rootless,
             )
-            with engine_faults(f"the container of node '{name}' cannot be started"):
+            with engine_faults(f"the container of node '{file.node.name}' cannot be started"):
                 container = self._engine.containers.create(**settings)
                 container.start()
             return RunningContainer(file, str(container.id), self._engine, events)
 
         with ThreadPoolExecutor(_MOST_AT_ONCE, "neuros-docker") as threads:
             work = []
-            for node, network in zip(nodes, self._networks(nodes, run_id), strict=True):
+            for node, network in zip(nodes, networks, strict=True):
                 work.append(threads.submit(start, node, network))
                 if network == NO_NETWORK and work[0].exception():  # the others need it
                     break
@@ -196,52 +198,27 @@ class DockerLauncher:
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
         """One line per container."""
-        return [self._description(node) for node in nodes]
-
-    def _networks(self, nodes: Sequence[NodeFile], run_id: str) -> Sequence[str]:
-        """The network of each container: this machine's, or one of the run's own."""
-        if not self._program.is_isolated:
-            return [NETWORK_MODE] * len(nodes)
-        first, *others = nodes
-        return [NO_NETWORK, *[f"container:{container_name(first, run_id)}"] * len(others)]
-
-    def _image(self, file: NodeFile) -> Image:
-        return self._containers.images[file.node.container]
-
-    def _description(self, file: NodeFile) -> str:
-        node, image = file.node, self._image(file)
-        command = shlex.join(self._program.command(image.start))
-        facts = [*_limits(file), *_openings(file), f"log: {log_file(file)}"]
-        where = on_cores(self._program.cores.get(node.name))
-        return f"container {node.name}{where} of image {image.name}: {command} ({'; '.join(facts)})"
-
-
-def _in_run_folder(nodes: Sequence[NodeFile]) -> list[Path]:
-    """Entries of the run folder that not all nodes may write to: folders, the project."""
-    entries = sorted(nodes[0].folders.run.iterdir())
-    return [path for path in entries if path.is_dir() or path.name == PROJECT_FILE]
-
-
-def _limits(file: NodeFile) -> list[str]:
-    resources = file.node.resources
-    facts = []
-    if resources.mem_bytes is not None:
-        facts.append(f"memory {memory_text(resources.mem_bytes)}")
-    if resources.cpus is not None:
-        facts.append(f"cpus {resources.cpus:g}")
-    if resources.pids is not None:
-        facts.append(f"pids {resources.pids}")
-    return facts
-
-
-def _openings(file: NodeFile) -> list[str]:
-    access = file.node.access
-    facts = [f"device {device}" for device in access.devices]
-    if access.gpus:
-        facts.append(f"gpus {' '.join(access.gpus)}")
-    if access.display:
-        facts.append("display")
-    return facts
+        lines = []
+        for file in nodes:
+            node, image = file.node, self._containers.images[file.node.container]
+            resources, access = node.resources, node.access
+            memory = resources.mem_bytes
+            facts = [
+                *([f"memory {memory_text(memory)}"] if memory is not None else []),
+                *([f"cpus {resources.cpus:g}"] if resources.cpus is not None else []),
+                *([f"pids {resources.pids}"] if resources.pids is not None else []),
+                *(f"device {device}" for device in access.devices),
+                *([f"gpus {' '.join(access.gpus)}"] if access.gpus else []),
+                *(["display"] if access.display else []),
+                f"log: {log_file(file)}",
+            ]
+            where = on_cores(self._program.cores.get(node.name))
+            command = shlex.join(self._program.command(image.start))
+            lines.append(
+                f"container {node.name}{where} of image {image.name}: {command}"
+                f" ({'; '.join(facts)})"
+            )
+        return lines
 
 
 class RunningContainer:
@@ -270,7 +247,7 @@ class RunningContainer:
         end = self._events.end_of(self.id)
         if end is not None:
             words = how_it_ended(*end, log_file(self._file), self._file.node.resources.mem_bytes)
-            is_stopped = self._events.is_signalled(self.id) and not self._is_told
+            is_stopped = self._events.fate(self.id).is_signalled and not self._is_told
             return f"{words}: {_STOPPED}" if is_stopped else words
         if self._events.lost and not self._events.pids(self._file.node.name):
             return f"the Docker engine went away ({self._events.lost}): start it again"
@@ -285,7 +262,13 @@ class RunningContainer:
         if self._events.lost:
             self._events.signal_all(signal.SIGKILL, self._file.node.name)
         else:
-            threading.Thread(target=self._tell_engine, daemon=True).start()
+
+            def tell_engine() -> None:
+                # It may have ended meanwhile; the events say what became of it.
+                with contextlib.suppress(DockerException, requests.RequestException):
+                    self._engine.api.kill(self.id)
+
+            threading.Thread(target=tell_engine, daemon=True).start()
 
     def threads(self) -> ProcessThreads:
         """Where its threads stand in Python; the first of its processes may be an init program."""
@@ -294,12 +277,7 @@ class RunningContainer:
             read = threads_of(pid)
             if read.threads:
                 break
-        return replace(read, stopped=_PAUSED) if self._events.is_paused(self.id) else read
-
-    def _tell_engine(self) -> None:
-        # It may have ended meanwhile; the events say what became of it.
-        with contextlib.suppress(DockerException, requests.RequestException):
-            self._engine.api.kill(self.id)
+        return replace(read, stopped=_PAUSED) if self._events.fate(self.id).is_paused else read
 
 
 def how_it_ended(exit_code: int, is_out_of_memory: bool, log: Path, mem_bytes: int | None) -> str:
@@ -323,8 +301,15 @@ def how_it_ended(exit_code: int, is_out_of_memory: bool, log: Path, mem_bytes: i
 
 
 @dataclass
-class _Fate:
-    """Events of a container so far; ``exit_code`` is ``None`` while it runs."""
+class Fate:
+    """Events of a container so far.
+
+    Attributes:
+        exit_code: ``None`` while it runs.
+        is_signalled: whether the engine has sent it a signal.
+        is_paused: whether the engine has frozen it (``docker pause``).
+        is_gone: whether it is removed.
+    """
 
     exit_code: int | None = None
     died_s: float = 0.0
@@ -352,7 +337,7 @@ class ContainerEvents(threading.Thread):
         super().__init__(name="neuros-containers", daemon=True)
         self.lost = ""
         self._run_id = run_id
-        self._fates: dict[str, _Fate] = {}
+        self._fates: dict[str, Fate] = {}
         self._awaited: set[str] = set()
         self._is_closing = False
         self._stream: Any = engine.events(
@@ -366,7 +351,19 @@ class ContainerEvents(threading.Thread):
         reason = "it closed the connection"
         try:
             for event in self._stream:
-                self._take(event)
+                action, actor = event["Action"], event["Actor"]
+                fate = self.fate(actor["ID"])
+                if action == "oom":
+                    fate.is_out_of_memory = True
+                elif action == "kill":
+                    fate.is_signalled = True
+                elif action in ("pause", "unpause"):
+                    fate.is_paused = action == "pause"
+                elif action == "die":
+                    fate.died_s = time.monotonic()
+                    fate.exit_code = int(actor["Attributes"]["exitCode"])
+                elif action in ("destroy", "remove"):  # podman says remove
+                    fate.is_gone = True
         except (DockerException, requests.RequestException, OSError, ValueError) as error:
             reason = str(error)
         if not self._is_closing:
@@ -385,8 +382,8 @@ class ContainerEvents(threading.Thread):
 
     def end_of(self, container_id: str) -> tuple[int, bool] | None:
         """The exit code of a container and whether it ran out of memory; ``None`` if it runs on."""
-        fate = self._fates.get(container_id)
-        if fate is None or fate.exit_code is None:
+        fate = self.fate(container_id)
+        if fate.exit_code is None:
             return None
         if not fate.is_gone and time.monotonic() - fate.died_s < _REMOVAL_S:
             return None
@@ -395,20 +392,15 @@ class ContainerEvents(threading.Thread):
             self.close()
         return fate.exit_code, fate.is_out_of_memory
 
-    def is_signalled(self, container_id: str) -> bool:
-        """Whether the engine has sent it a signal."""
-        fate = self._fates.get(container_id)
-        return fate is not None and fate.is_signalled
-
-    def is_paused(self, container_id: str) -> bool:
-        """Whether the engine has frozen it (`docker pause`)."""
-        fate = self._fates.get(container_id)
-        return fate is not None and fate.is_paused
+    def fate(self, container_id: str) -> Fate:
+        """What has happened to a container so far."""
+        return self._fates.setdefault(container_id, Fate())
 
     def pids(self, node: str | None = None) -> Sequence[int]:
         """Of the processes of a node, or of all, as this machine sees them; the oldest first."""
         found = RunProcesses(self._run_id).nodes()
-        return sorted((pid for pid in found if node in (None, found[pid])), key=_age)
+        mine = (pid for pid in found if node in (None, found[pid]))
+        return sorted(mine, key=lambda pid: started_at(pid) or 0)
 
     def signal_all(self, number: int, node: str | None = None) -> None:
         """Send a signal to the processes of the run, or of one node, without the engine."""
@@ -416,40 +408,18 @@ class ContainerEvents(threading.Thread):
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(pid, number)
 
-    def _take(self, event: dict[str, Any]) -> None:
-        actor = event["Actor"]
-        fate = self._fates.setdefault(actor["ID"], _Fate())
-        if event["Action"] == "oom":
-            fate.is_out_of_memory = True
-        elif event["Action"] == "kill":
-            fate.is_signalled = True
-        elif event["Action"] in ("pause", "unpause"):
-            fate.is_paused = event["Action"] == "pause"
-        elif event["Action"] == "die":
-            fate.died_s = time.monotonic()
-            fate.exit_code = int(actor["Attributes"]["exitCode"])
-        elif event["Action"] in ("destroy", "remove"):  # podman says remove
-            fate.is_gone = True
-
-
-def _age(pid: int) -> int:
-    return started_at(pid) or 0
-
 
 def find_tool_image(environ: Mapping[str, str] = os.environ) -> str | None:
     """``None`` if there is the image, else in a few words why not."""
     try:
-        engine = connect(environ)
+        with contextlib.closing(connect(environ)) as engine:
+            engine.images.get(TOOL_IMAGE)
     except EnvironmentFault:
         return f"there is no Docker engine for the image {TOOL_IMAGE}"
-    try:
-        engine.images.get(TOOL_IMAGE)
     except ImageNotFound:
         return f"the image {TOOL_IMAGE} is not built ({build_command(TOOL_IMAGE)})"
     except (DockerException, requests.RequestException) as error:
         return f"the Docker engine does not say whether it has the image {TOOL_IMAGE}: {error}"
-    finally:
-        engine.close()
     return None
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,6 @@ from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.node_command import (
     DEFAULTS,
     THREAD_VARIABLES,
-    Cores,
     log_file,
     moved,
     node_environment,
@@ -84,60 +83,16 @@ _TMP = "rw,exec,nosuid,nodev,size=1g,mode=1777"
 _START = 'echo "the output of this node is in $1"; log=$0; shift; exec "$@" >>"$log" 2>&1'
 
 
-@dataclass(frozen=True)
-class User:
-    """Whose rights a container has, and what of the user's session it may be let in to.
-
-    Attributes:
-        groups: further groups, those that own the devices of nodes.
-        environ: the environment of the launcher.
-        xauthority: the file with the key to the display that it names.
-        dds_settings: the file that its ``FASTRTPS_DEFAULT_PROFILES_FILE`` names.
-    """
-
-    uid: int
-    gid: int
-    groups: tuple[int, ...] = ()
-    environ: Mapping[str, str] = field(default_factory=dict)
-    xauthority: Path | None = None
-    dds_settings: Path | None = None
-
-    @property
-    def display(self) -> str:
-        """The X11 display, as in ``DISPLAY``; empty if there is none."""
-        return self.environ.get("DISPLAY", "")
-
-
-def user_for(file: NodeFile, environ: Mapping[str, str], *, is_rootless: bool = False) -> User:
-    """The caller, as far as a node is let in to what belongs to the caller.
-
-    A rootless engine calls its user root in containers, with no more rights.
-
-    Raises:
-        EnvironmentFault: if a device of the node, or a file with settings of DDS, is not there.
-    """
-    groups = {_group_of(file, device) for device in file.node.access.devices}
-    key = Path(environ.get("XAUTHORITY") or Path(environ.get("HOME", "/")) / ".Xauthority")
-    return User(
-        0 if is_rootless else os.getuid(),
-        0 if is_rootless else os.getgid(),
-        () if is_rootless else tuple(sorted(groups.intersection(os.getgroups()))),
-        environ,
-        key if file.node.access.display and key.is_file() else None,
-        _dds_settings(environ.get(DDS_SETTINGS)),
-    )
-
-
 def container_settings(
     file: NodeFile,
     image: Image,
-    user: User,
     program: NodeProgram,
     environment: Mapping[str, str],
     *,
     others: Sequence[Path] = (),
     launcher_pid: int = 0,
     network: str = NETWORK_MODE,
+    is_rootless: bool = False,
 ) -> dict[str, Any]:
     """The arguments of ``docker.containers.create`` for a node.
 
@@ -147,20 +102,90 @@ def container_settings(
         others: what is in the run folder and not the node's own; it can only read that.
         launcher_pid: said in a label.
         network: that of this machine, none, or that of another container.
+        is_rootless: whether the engine is, which calls its user root in containers, with no more
+            rights.
+
+    Raises:
+        EnvironmentFault: if a device of the node, or a file with settings of DDS, is not there.
     """
-    node = file.node
+    node, environ, seen = file.node, program.environ, inside(file)
     run_id, cores = environment.get(RUN_ID, ""), program.cores.get(node.name)
-    settings: dict[str, Any] = {
+    told = {
+        **DEFAULTS,
+        **{key: environ[key] for key in PASSED_ON if key in environ},
+        "HOME": "/tmp",
+        "XDG_CACHE_HOME": "/tmp/.cache",  # for libraries that go by the user's entry instead
+        "USER": "neuros",  # for programs that ask who they are: the id has no name in the image
+        **(thread_limits([node]) if cores else {}),
+        **node_environment(seen),
+        **environment,
+        **with_messages({"PYTHONPATH": str(LIBRARY)}, seen.messages),
+        "ROS_LOG_DIR": str(FOLDERS.run),
+    }
+    if address := environment.get(CONTROL_VARIABLE):
+        told[CONTROL_VARIABLE] = address.replace(str(file.folders.run), str(FOLDERS.run))
+    own = node_folder(file) / "node.json"
+    mounts = [
+        mount(PACKAGE, LIBRARY / PACKAGE.name),
+        mount(file.folders.project, FOLDERS.project),
+        mount(file.folders.run, FOLDERS.run, read_only=False),
+        # In a folder that it may write to; but what it was told stays as it was.
+        mount(own, node_folder(seen) / own.name),
+        *(mount(path, FOLDERS.run / path.relative_to(file.folders.run)) for path in others),
+        mount(shared_memory(run_id), SHARED_MEMORY, read_only=False),
+    ]
+    if file.folders.workspace.is_dir():  # an installed NeuROS comes without one
+        mounts.append(mount(file.folders.workspace, FOLDERS.workspace))
+    for here, there in zip(file.messages, seen.messages, strict=True):
+        mounts.append(mount(here.parent, there.parent))
+    if named := environ.get(DDS_SETTINGS):
+        path = Path(named).absolute()
+        if not path.is_file():
+            raise EnvironmentFault(
+                f"{DDS_SETTINGS}={named}: there is no such file: unset it, or name one"
+            )
+        told[DDS_SETTINGS] = str(DDS_FILE)
+        mounts.append(mount(path, DDS_FILE))
+    if node.access.display and (display := environ.get("DISPLAY")):
+        told["DISPLAY"] = display
+        if "NEUROS_GUI" in environ:
+            told.setdefault("NEUROS_GUI", environ["NEUROS_GUI"])
+        if X11.is_dir():  # with a display over the network (ssh -X) there may be none
+            mounts.append(mount(X11, X11))
+        key = Path(environ.get("XAUTHORITY") or Path(environ.get("HOME", "/")) / ".Xauthority")
+        if key.is_file():
+            told["XAUTHORITY"] = str(XAUTHORITY)
+            mounts.append(mount(key, XAUTHORITY))
+    groups = set()
+    for device in node.access.devices:
+        try:
+            groups.add(os.stat(device).st_gid)
+        except OSError as error:
+            raise EnvironmentFault(
+                f"node '{node.name}' asks for the device {device}: {error.strerror}: is it plugged"
+                f" in? Another one: --set nodes.{node.name}.devices='[\"/dev/...\"]'"
+            ) from error
+    groups.intersection_update(() if is_rootless else os.getgroups())
+    return {
         "image": image.id,
         "name": container_name(file, run_id),
-        "entrypoint": start_command(file, image, program),
+        "entrypoint": [
+            *("/bin/sh", "-c", _START, str(log_file(seen)), str(log_file(file))),
+            *start_arguments(program.command(image.start), [seen]),
+        ],
         "command": [],
-        "environment": _environment(file, user, environment, cores),
+        "environment": told,
         "working_dir": str(FOLDERS.run),
-        "labels": _labels(file, run_id, launcher_pid),
-        "mounts": _mounts(file, user, run_id, others),
-        "user": f"{user.uid}:{user.gid}",
-        "group_add": [str(group) for group in user.groups],
+        "labels": {
+            RUN_LABEL: run_id,
+            "neuros.node": node.name,
+            "neuros.project": str(file.folders.project),
+            "neuros.run_folder": str(file.folders.run),
+            "neuros.launcher": str(launcher_pid),
+        },
+        "mounts": mounts,
+        "user": "0:0" if is_rootless else f"{os.getuid()}:{os.getgid()}",
+        "group_add": [str(group) for group in sorted(groups)],
         "cap_drop": ["ALL"],
         "security_opt": ["no-new-privileges"],
         "read_only": True,
@@ -170,10 +195,8 @@ def container_settings(
         "ipc_mode": IPC_MODE,
         "auto_remove": True,
         **limits(node),
+        **({"cpuset_cpus": ",".join(map(str, cores))} if cores else {}),
     }
-    if cores:
-        settings["cpuset_cpus"] = ",".join(map(str, cores))
-    return settings
 
 
 def limits(node: Node) -> dict[str, Any]:
@@ -204,115 +227,21 @@ def shared_memory(run_id: str) -> Path:
     return SHARED_MEMORY / f"neuros_{run_id}"
 
 
-def start_command(file: NodeFile, image: Image, program: NodeProgram) -> list[str]:
-    """The command of a container, in place of the image's own."""
-    seen = inside(file)
-    return [
-        *("/bin/sh", "-c", _START, str(log_file(seen)), str(log_file(file))),
-        *start_arguments(program.command(image.start), [seen]),
-    ]
-
-
-def _environment(
-    file: NodeFile, user: User, added: Mapping[str, str], cores: Cores | None
-) -> dict[str, str]:
-    environment = {
-        **DEFAULTS,
-        **{key: user.environ[key] for key in PASSED_ON if key in user.environ},
-        "HOME": "/tmp",
-        "XDG_CACHE_HOME": "/tmp/.cache",  # for libraries that go by the user's entry instead
-        "USER": "neuros",  # for programs that ask who they are: the id has no name in the image
-        **(thread_limits([file.node]) if cores else {}),
-        **node_environment(inside(file)),
-        **added,
-        **with_messages({"PYTHONPATH": str(LIBRARY)}, inside(file).messages),
-        "ROS_LOG_DIR": str(FOLDERS.run),
-    }
-    if address := added.get(CONTROL_VARIABLE):
-        environment[CONTROL_VARIABLE] = address.replace(str(file.folders.run), str(FOLDERS.run))
-    if user.dds_settings:
-        environment[DDS_SETTINGS] = str(DDS_FILE)
-    if file.node.access.display and user.display:
-        environment["DISPLAY"] = user.display
-        if "NEUROS_GUI" in user.environ:
-            environment.setdefault("NEUROS_GUI", user.environ["NEUROS_GUI"])
-        if user.xauthority:
-            environment["XAUTHORITY"] = str(XAUTHORITY)
-    return environment
-
-
-def _labels(file: NodeFile, run_id: str, launcher_pid: int) -> dict[str, str]:
-    return {
-        RUN_LABEL: run_id,
-        "neuros.node": file.node.name,
-        "neuros.project": str(file.folders.project),
-        "neuros.run_folder": str(file.folders.run),
-        "neuros.launcher": str(launcher_pid),
-    }
-
-
-def _mounts(
-    file: NodeFile, user: User, run_id: str, others: Sequence[Path]
-) -> list[dict[str, Any]]:
-    own = node_folder(file) / "node.json"
-    mounts = [
-        mount(PACKAGE, LIBRARY / PACKAGE.name),
-        mount(file.folders.project, FOLDERS.project),
-        mount(file.folders.run, FOLDERS.run, read_only=False),
-        # In a folder that it may write to; but what it was told stays as it was.
-        mount(own, node_folder(inside(file)) / own.name),
-        *(mount(path, FOLDERS.run / path.relative_to(file.folders.run)) for path in others),
-        mount(shared_memory(run_id), SHARED_MEMORY, read_only=False),
-    ]
-    if file.folders.workspace.is_dir():  # an installed NeuROS comes without one
-        mounts.append(mount(file.folders.workspace, FOLDERS.workspace))
-    mounts += [
-        mount(here.parent, there.parent)
-        for here, there in zip(file.messages, inside(file).messages, strict=True)
-    ]
-    if user.dds_settings:
-        mounts.append(mount(user.dds_settings, DDS_FILE))
-    if file.node.access.display and user.display:
-        if X11.is_dir():  # with a display over the network (ssh -X) there may be none
-            mounts.append(mount(X11, X11))
-        if user.xauthority:
-            mounts.append(mount(user.xauthority, XAUTHORITY))
-    return mounts
-
-
 def mount(here: Path, there: Path, *, read_only: bool = True) -> dict[str, Any]:
     """A folder or file of this machine, as a container sees it."""
     return {"Type": "bind", "Source": str(here), "Target": str(there), "ReadOnly": read_only}
 
 
-def _dds_settings(named: str | None) -> Path | None:
-    if not named:
-        return None
-    path = Path(named).absolute()
-    if not path.is_file():
-        raise EnvironmentFault(
-            f"{DDS_SETTINGS}={named}: there is no such file: unset it, or name one"
-        )
-    return path
-
-
-def _group_of(file: NodeFile, device: str) -> int:
-    try:
-        return os.stat(device).st_gid
-    except OSError as error:
-        raise EnvironmentFault(
-            f"node '{file.node.name}' asks for the device {device}: {error.strerror}: is it plugged"
-            f" in? Another one: --set nodes.{file.node.name}.devices='[\"/dev/...\"]'"
-        ) from error
-
-
 def inside(file: NodeFile) -> NodeFile:
-    """A node with all paths as it sees them in its container."""
+    """A node with all paths as it sees them in its container; what it does not see stays."""
+    here = file.folders
+    places = [(here.project, FOLDERS.project), (here.workspace, FOLDERS.workspace)]
+    places += [(python.parent, MESSAGES / python.parent.name) for python in file.messages]
     return replace(
         file,
-        node=translated(file.node, lambda path: _inside(path, file)),
+        node=translated(file.node, lambda path: moved(path, places)),
         folders=FOLDERS,
-        messages=tuple(_inside(path, file) for path in file.messages),
+        messages=tuple(moved(path, places) for path in file.messages),
     )
 
 
@@ -336,11 +265,3 @@ def as_here(text: str, folders: Folders) -> str:
     """Text of a node, with its paths replaced by those of this machine."""
     here = {each.name: str(getattr(folders, each.name)) for each in fields(Folders)}
     return _INSIDE.sub(lambda match: here[match[1]], text)
-
-
-def _inside(path: Path, file: NodeFile) -> Path:
-    """A path of this machine as a container sees it; what it does not see stays as it is."""
-    here = file.folders
-    mounted = [(here.project, FOLDERS.project), (here.workspace, FOLDERS.workspace)]
-    mounted += [(python.parent, MESSAGES / python.parent.name) for python in file.messages]
-    return moved(path, mounted)
