@@ -10,6 +10,7 @@ import difflib
 import hashlib
 import os
 import re
+import tarfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -231,3 +232,11 @@ def files_of(folder: Path) -> Iterator[Path]:
     for file in sorted(folder.rglob("*")):
         if file.is_file() and "__pycache__" not in file.parts:
             yield file
+
+
+def for_all(entry: tarfile.TarInfo) -> tarfile.TarInfo:
+    """A file or folder in an archive, as anybody may read and nobody but root may change it."""
+    entry.uid = entry.gid = 0
+    entry.uname = entry.gname = ""
+    entry.mode = 0o755 if entry.mode & 0o111 else 0o644
+    return entry

@@ -16,7 +16,7 @@ import pytest
 
 from neuros.api import loading
 from neuros.api.loading import load_with_messages
-from neuros.backends.docker.back_end import _check_modules
+from neuros.backends.docker.back_end import check_modules
 from neuros.errors import ProjectError
 from neuros.project.model import Node, Port
 from neuros.project.split import project_to_json
@@ -439,7 +439,7 @@ class TestProject:
         assert replace(again, file=nodes[0].file) == nodes[0]
 
     def test_its_container_in_docker_has_what_it_needs(self, project: Path) -> None:
-        _check_modules(load_with_messages(project)[0].project.nodes, project)
+        check_modules(load_with_messages(project)[0].project.nodes, project)
 
     def test_a_missing_file_and_one_that_is_no_network_are_told(self, project: Path) -> None:
         (told,) = self.problems(project, "nodes.brain.network=nor.nir")

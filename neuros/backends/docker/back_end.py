@@ -35,7 +35,7 @@ class Docker(BackEnd):
             raise EnvironmentFault(
                 f"the Python package docker is not installed: {install_command()}"
             )
-        _check_modules(nodes, project.folder)
+        check_modules(nodes, project.folder)
         # The Docker SDK is slow to import.
         from neuros.backends.docker.launcher import Containers
 
@@ -65,7 +65,7 @@ class Docker(BackEnd):
 BACK_END = Docker()
 
 
-def _check_modules(nodes: Sequence[Node], project: Path) -> None:
+def check_modules(nodes: Sequence[Node], project: Path) -> None:
     """Check that no plugin is a module that its node's container cannot have.
 
     Raises:

@@ -37,6 +37,7 @@ from neuros.backends.containers import (
     bare_name,
     files_of,
     find_recipe,
+    for_all,
     in_order,
 )
 from neuros.backends.docker.dockerfile import after_each_from, arguments_of, images_in, on_images
@@ -242,21 +243,22 @@ class ImageBuilder:
                 if old and (base := old.labels.get(_BASE)) and recipe.takes(base):
                     bases[recipe.name] = base
         bases |= self._bases
-        wanted = {recipe.name: recipe for recipe in in_order(recipes, bases)}
+        wanted = in_order(recipes, bases)
+        by_name = {recipe.name: recipe for recipe in wanted}
         for name, base in self._bases.items():
-            if name not in wanted:
-                names = ", ".join(sorted(wanted)) or "none"
+            if name not in by_name:
+                names = ", ".join(sorted(by_name)) or "none"
                 raise UsageError(
                     f"--base-image {name}={base}: no container '{name}' is built here (there are:"
                     f" {names})"
                 )
-            if not wanted[name].takes(base):
+            if not by_name[name].takes(base):
                 raise UsageError(
-                    f"--base-image {name}={base}: {wanted[name].folder}/Dockerfile does not begin"
+                    f"--base-image {name}={base}: {by_name[name].folder}/Dockerfile does not begin"
                     f" from {BASE_ARGUMENT}: let it begin with 'ARG {BASE_ARGUMENT}=...' and"
                     f" 'FROM ${{{BASE_ARGUMENT}}}', or write the image into its FROM line"
                 )
-        for recipe in wanted.values():
+        for recipe in wanted:
             with engine_faults(f"image '{recipe.name}' cannot be built"):
                 self._bring_up_to_date(recipe, bases.get(recipe.name, ""))
 
@@ -302,8 +304,15 @@ class ImageBuilder:
                 if bare_name(image) not in names and image != "scratch":
                     self._progress.detail(f"{recipe.name}: pulling {image}")
                     pulled(self._engine, image, newest=True)
-        begin = {parent.name: built_image(parent, self._engine) for parent in parents}
-        names_of_parents = {name: str(image.tags[0]) for name, image in begin.items() if image}
+        begin: dict[str, Any] = {each.name: built_image(each, self._engine) for each in parents}
+        # BuildKit takes an id for a name. Those that a user has given may go at any time.
+        names_of_parents = {
+            parent.name: next(
+                (tag for tag in parent.tags if tag in begin[parent.name].tags),
+                begin[parent.name].tags[0],
+            )
+            for parent in parents
+        }
         if base and base not in begin:
             begin[base] = pulled(self._engine, base, newest=self._pull)
         # Arguments of last time count again.
@@ -316,7 +325,7 @@ class ImageBuilder:
             DIGEST: recipe.digest,
             _BASE: base,
             _ARGUMENTS: json.dumps(arguments, sort_keys=True),
-            _FROM: json.dumps({n: i.id for n, i in begin.items() if i}, sort_keys=True),
+            _FROM: json.dumps({n: image.id for n, image in begin.items()}, sort_keys=True),
         }
         compared = (DIGEST, _BASE, _ARGUMENTS, _FROM)
         if old and not self._pull and all(was.get(key) == labels[key] for key in compared):
@@ -502,20 +511,12 @@ def context_of(
 
     A link becomes the file that it leads to, which may be outside.
     """
-
-    def anonymous(entry: tarfile.TarInfo) -> tarfile.TarInfo:
-        """Make it readable by all, without its owner."""
-        entry.uid = entry.gid = 0
-        entry.uname = entry.gname = ""
-        entry.mode = 0o755 if entry.mode & 0o111 else 0o644
-        return entry
-
     with tempfile.TemporaryFile() as archive:
         # Not every docker can tell an archive from a Dockerfile, but if it is compressed.
         with tarfile.open(fileobj=archive, mode="w:gz", compresslevel=1, dereference=True) as tar:
             for file in files_of(folder) if folder else ():
                 if file.name != "Dockerfile" or file.parent != folder:
-                    tar.add(file, str(file.relative_to(folder or file)), filter=anonymous)
+                    tar.add(file, str(file.relative_to(folder or file)), filter=for_all)
             for name, content in {"Dockerfile": dockerfile.encode(), **further}.items():
                 entry = tarfile.TarInfo(name)
                 entry.size, entry.mode = len(content), 0o644

@@ -26,6 +26,7 @@ import requests
 from docker import DockerClient
 from docker.errors import DockerException, NotFound
 
+from neuros.backends.containers import for_all
 from neuros.backends.docker.engine import (
     OR_WITHOUT,
     Abilities,
@@ -89,12 +90,11 @@ class RemoteEngine:
                 self._address = f"unix://{engine_socket(self._engine)}"
             with engine_faults("Docker"):
                 self._is_rootless = Abilities.of(self._engine.info()).is_rootless
-        except EnvironmentFault as fault:
+        except BaseException as error:
             self.close()
-            why = str(fault).removesuffix(f", {OR_WITHOUT}")  # which it cannot do without
-            raise EnvironmentFault(f"{host}: {why}") from fault
-        except BaseException:
-            self.close()
+            if isinstance(error, EnvironmentFault):
+                why = str(error).removesuffix(f", {OR_WITHOUT}")  # which it cannot do without
+                raise EnvironmentFault(f"{host}: {why}") from error
             raise
 
     def container(self, node: Node, project: Path, log: Log) -> AgentContainer:
@@ -106,7 +106,15 @@ class RemoteEngine:
         try:
             image = self._image(node.container, project, log)
             with engine_faults(f"the container of node '{node.name}'"):
-                self._remove_never_started()
+                # Those whose launcher was killed between two requests are never started.
+                wanted = {"label": AGENT_LABEL, "status": "created"}
+                for container in self._engine.containers.list(
+                    all=True, filters=wanted, ignore_removed=True
+                ):
+                    made = datetime.fromisoformat(f"{container.attrs['Created'][:19]}+00:00")
+                    if (datetime.now(timezone.utc) - made).total_seconds() > _NEVER_STARTED_S:
+                        with contextlib.suppress(NotFound):  # another launcher clears up, too
+                            container.remove(force=True)
                 return AgentContainer(
                     self._engine, self._address, node, image, 0 if self._is_rootless else _USER
                 )
@@ -140,7 +148,8 @@ class RemoteEngine:
                 )
             except OSError as error:
                 raise EnvironmentFault(f"ssh cannot be started ({error.strerror})") from error
-        self._held.callback(_end, tunnel)
+        self._held.callback(tunnel.communicate)
+        self._held.callback(tunnel.kill)
         assert tunnel.stdout is not None
         said = tunnel.stdout.readline()
         end_s = time.monotonic() + _CONNECT_S
@@ -166,30 +175,16 @@ class RemoteEngine:
                 here = image_for(container, project, engine)
                 if there is not None and here.notice:
                     return there
-                self._send(engine, here, log)
+                with engine_faults(f"the image {here.name}"):
+                    found = engine.images.get(here.id)
+                    size = memory_text(int(found.attrs["Size"]))
+                    log("INFO", f"{self.host.name} gets the image {here.name} ({size}), once")
+                    self._engine.images.load(found.save(named=True))
                 return here
         except EnvironmentFault:
             if there is not None:
                 return there
         raise EnvironmentFault(f"{why}, here, or there with DOCKER_HOST={self.host.docker}")
-
-    def _send(self, engine: DockerClient, image: Image, log: Log) -> None:
-        with engine_faults(f"the image {image.name}"):
-            found = engine.images.get(image.id)
-            size = memory_text(int(found.attrs["Size"]))
-            log("INFO", f"{self.host.name} gets the image {image.name} ({size}), once")
-            self._engine.images.load(found.save(named=True))
-
-    def _remove_never_started(self) -> None:
-        """Containers whose launcher was killed between two requests."""
-        wanted = {"label": AGENT_LABEL, "status": "created"}
-        for container in self._engine.containers.list(
-            all=True, filters=wanted, ignore_removed=True
-        ):
-            made = datetime.fromisoformat(f"{container.attrs['Created'][:19]}+00:00")
-            if (datetime.now(timezone.utc) - made).total_seconds() > _NEVER_STARTED_S:
-                with contextlib.suppress(NotFound):  # another launcher clears up, too
-                    container.remove(force=True)
 
 
 class AgentContainer:
@@ -271,19 +266,9 @@ class AgentContainer:
                 entry.type, entry.mode, entry.uid, entry.gid = tarfile.DIRTYPE, 0o700, user, user
                 tar.addfile(entry)
             for there, here in trees.items():
-                tar.add(here, str(there.relative_to("/")), filter=_for_all)
+                tar.add(
+                    here,
+                    str(there.relative_to("/")),
+                    filter=lambda each: None if "__pycache__" in each.name else for_all(each),
+                )
         self._container.put_archive("/", archive.getvalue())
-
-
-def _end(process: subprocess.Popen[str]) -> None:
-    process.kill()
-    process.communicate()
-
-
-def _for_all(entry: tarfile.TarInfo) -> tarfile.TarInfo | None:
-    """Files that anybody may read and nobody change; without what Python has compiled."""
-    if entry.name.endswith("__pycache__"):
-        return None
-    entry.uid = entry.gid = 0
-    entry.mode = 0o755 if entry.isdir() or entry.mode & 0o100 else 0o644
-    return entry
