@@ -57,9 +57,12 @@ class TestCauses:
             (
                 "the --mount option requires BuildKit. Refer to https://docs.docker.com/go/buildkit",
                 "the --mount option requires BuildKit. Refer to https://docs.docker.com/go/buildkit:"
-                " this may need a newer BuildKit: install docker-buildx",
+                " unless that is a slip of the pen, it takes a newer BuildKit: install",
             ),
-            ("Dockerfile parse error line 2: Unknown flag: link", "Unknown flag: link: this may"),
+            (
+                "Dockerfile parse error line 2: Unknown flag: link",
+                "link: unless that is",
+            ),
         ],
     )
     def test_what_a_user_can_mend_is_one_sentence_with_the_next_step(

@@ -88,8 +88,8 @@ _CAUSES = (
     (
         r"requires BuildKit|dockerfile parse error.*unknown (flag|instruction)"
         r"|BuildKit is enabled but the buildx component is missing",
-        "{said}: this may need a newer BuildKit: install docker-buildx (from docker.com:"
-        " docker-buildx-plugin; before docker 23: export DOCKER_BUILDKIT=1), or write it without",
+        "{said}: unless that is a slip of the pen, it takes a newer BuildKit: install docker-buildx"
+        " (from docker.com: docker-buildx-plugin; before docker 23: export DOCKER_BUILDKIT=1)",
     ),
     (
         r"(?:Get|Head) \"?https?://(?P<what>[^/\"]+)|lookup (?P<also>\S+).* no such host",
