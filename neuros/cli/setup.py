@@ -130,7 +130,7 @@ def add_containers(containers: argparse.ArgumentParser) -> None:
 
 
 def _build_images(options: argparse.Namespace) -> int:
-    from neuros.backends.docker.building import ImageBuilder, served, surroundings
+    from neuros.backends.docker.building import ImageBuilder, Surroundings, served
     from neuros.backends.docker.engine import connect, require_program
     from neuros.installation.progress import Progress
 
@@ -149,7 +149,7 @@ def _build_images(options: argparse.Namespace) -> int:
             print(f"no containers are built, so projects run as processes: {fault}")
             return 0
         wheels = stack.enter_context(served(wheelhouse)) if wheelhouse else ""
-        around = surroundings(engine, os.environ, bundle, wheels)
+        around = Surroundings(engine, os.environ, bundle, wheels)
         progress, logs = Progress(sys.stdout), cache_root(os.environ) / "builds"
         builder = ImageBuilder(
             engine, around, progress, logs, bases=bases, arguments=arguments, pull=options.pull

@@ -12,10 +12,10 @@ import pytest
 
 from neuros.backends.docker.building import (
     CERTIFICATES,
+    Surroundings,
     cause_of,
     context_of,
     served,
-    surroundings,
 )
 from neuros.backends.docker.images import PythonInImage, chosen
 from neuros.errors import EnvironmentFault
@@ -164,27 +164,27 @@ def engine_with(*networks: str) -> Any:
 class TestSurroundings:
     def test_proxies_are_passed_on_in_both_spellings(self) -> None:
         environ = {"https_proxy": "http://p:1", "NO_PROXY": "x", "HOME": "/root"}
-        around = surroundings(engine_with("bridge"), environ, None, "")
+        around = Surroundings(engine_with("bridge"), environ, None, "")
         assert around.arguments == {"https_proxy": "http://p:1", "NO_PROXY": "x"}
         assert around.network is None
         assert around.lines == ""
 
     def test_without_a_bridge_builds_use_the_network_of_this_machine(self) -> None:
-        assert surroundings(engine_with("host", "none"), {}, None, "").network == "host"
+        assert Surroundings(engine_with("host", "none"), {}, None, "").network == "host"
 
     def test_nor_would_a_proxy_on_this_machine_be_found_from_the_bridge(self) -> None:
         environ = {"HTTPS_PROXY": "http://localhost:3128"}
-        assert surroundings(engine_with("bridge"), environ, None, "").network == "host"
+        assert Surroundings(engine_with("bridge"), environ, None, "").network == "host"
 
     def test_with_a_wheelhouse_nothing_else_is_asked(self) -> None:
-        around = surroundings(engine_with("bridge"), {"HTTP_PROXY": "x"}, None, "http://w/")
+        around = Surroundings(engine_with("bridge"), {"HTTP_PROXY": "x"}, None, "http://w/")
         assert around.arguments == {"SYSTEM_PACKAGES": "", "WINDOWS": "no"}
         assert around.network == "host"
         assert around.lines == "ARG PIP_NO_INDEX=1 PIP_FIND_LINKS=http://w/"
 
     def test_certificates_lie_beside_every_dockerfile(self, tmp_path: Path) -> None:
         (tmp_path / "ca.pem").write_text("PEM")
-        around = surroundings(engine_with("bridge"), {}, tmp_path / "ca.pem", "")
+        around = Surroundings(engine_with("bridge"), {}, tmp_path / "ca.pem", "")
         ((name, content),) = around.files.items()
         assert content == b"PEM"
         assert f"COPY {name} {CERTIFICATES}\n" in around.lines

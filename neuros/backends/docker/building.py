@@ -18,7 +18,6 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from io import BytesIO
@@ -116,56 +115,40 @@ _CAUSES = (
 )
 
 
-@dataclass(frozen=True)
 class Surroundings:
-    """Needs of this machine that all builds share.
+    """Needs of this machine that all builds share, from its environment and the engine.
+
+    A wheelhouse leaves proxies out, and packages of the operating system.
+
+    Args:
+        ca_bundle: a file with certificates to trust besides, PEM.
+        wheels: the address of a wheelhouse, or "".
 
     Attributes:
         arguments: build arguments; the engine keeps proxies out of the images' history.
         network: of the build, ``None`` for the engine's default.
-        ca_bundle: certificates to trust besides, PEM.
-        wheels: the address of a wheelhouse, or "".
+        files: to lay beside every Dockerfile.
+        lines: to declare in every stage of a Dockerfile.
     """
 
-    arguments: Mapping[str, str] = field(default_factory=lambda: _NOTHING)
-    network: str | None = None
-    ca_bundle: bytes = b""
-    wheels: str = ""
-
-    @property
-    def files(self) -> dict[str, bytes]:
-        """Files to lay beside every Dockerfile."""
-        return {_CERTIFICATES_IN_CONTEXT: self.ca_bundle} if self.ca_bundle else {}
-
-    @property
-    def lines(self) -> str:
-        """Lines to declare in every stage of a Dockerfile."""
+    def __init__(
+        self, engine: DockerClient, environ: Mapping[str, str], ca_bundle: Path | None, wheels: str
+    ) -> None:
+        names = [name for upper in _PROXIES for name in (upper, upper.lower())]
+        proxies = {name: environ[name] for name in names if environ.get(name)}
+        is_here = any("127.0.0.1" in url or "localhost" in url for url in proxies.values())
+        has_bridge = any(network.name == "bridge" for network in engine.networks.list())
+        self.arguments = {"SYSTEM_PACKAGES": "", "WINDOWS": "no"} if wheels else proxies
+        self.network = "host" if wheels or is_here or not has_bridge else None
+        self.files: dict[str, bytes] = {}
         lines = []
-        if self.ca_bundle:
+        if ca_bundle:
+            self.files[_CERTIFICATES_IN_CONTEXT] = ca_bundle.read_bytes()
             lines.append(f"COPY {_CERTIFICATES_IN_CONTEXT} {CERTIFICATES}")
             lines.append(f"ARG {' '.join(f'{name}={CERTIFICATES}' for name in _TRUST)}")
-        if self.wheels:
-            lines.append(f"ARG PIP_NO_INDEX=1 PIP_FIND_LINKS={self.wheels}")
-        return "\n".join(lines)
-
-
-def surroundings(
-    engine: DockerClient, environ: Mapping[str, str], ca_bundle: Path | None, wheels: str
-) -> Surroundings:
-    """Needs of this machine, from its environment and the engine.
-
-    A wheelhouse leaves proxies out, and packages of the operating system.
-    """
-    names = [name for upper in _PROXIES for name in (upper, upper.lower())]
-    proxies = {name: environ[name] for name in names if environ.get(name)}
-    is_here = any("127.0.0.1" in url or "localhost" in url for url in proxies.values())
-    has_bridge = any(network.name == "bridge" for network in engine.networks.list())
-    return Surroundings(
-        arguments={"SYSTEM_PACKAGES": "", "WINDOWS": "no"} if wheels else proxies,
-        network="host" if wheels or is_here or not has_bridge else None,
-        ca_bundle=ca_bundle.read_bytes() if ca_bundle else b"",
-        wheels=wheels,
-    )
+        if wheels:
+            lines.append(f"ARG PIP_NO_INDEX=1 PIP_FIND_LINKS={wheels}")
+        self.lines = "\n".join(lines)
 
 
 @contextlib.contextmanager
@@ -452,7 +435,7 @@ class _Builds:
     def finish(self, image: str, tags: Sequence[str], labels: Mapping[str, str]) -> None:
         """Take away what only the build needed, write the labels, and give it its names."""
         lines = [f"FROM {image}"]
-        if self._around.ca_bundle:
+        if self._around.files:
             user = self._engine.images.get(image).attrs["Config"].get("User") or "0"
             lines += ["USER 0", f"RUN rm -f {CERTIFICATES}", f"USER {user}"]
         options = ["--network", "none"]
