@@ -40,6 +40,14 @@ Event = Callable[[], None]
 _TURN_NS = 1_000_000
 _LONGEST_TURN_NS = 10_000_000
 _EVENTS = 8
+# Between two events the executor releases Python's global lock and takes it again at once. A thread
+# that waits for the lock is woken each time, in vain, and never has waited for the 5 ms after which
+# Python would make this thread give it up. So a loop without pause would keep the thread of the
+# control channel from its work for seconds. It sleeps for a moment now and then, if it has been
+# running for most of the time since the last look.
+_LOOK_NS = 50_000_000
+_MOST_BUSY = 0.8
+_GAP_S = 50e-6
 _LONG_S = 3600.0
 _TAKE_IN_S = 0.5
 
@@ -82,6 +90,8 @@ class RosLoop:
         self._planned_ns: int | None = None
         self._has_older_events = False
         self._is_stopping = False
+        self._looked_ns = 0
+        self._busy_ns = 0  # processor time of this thread at the last look
 
     @property
     def is_limited(self) -> bool:
@@ -228,6 +238,8 @@ class RosLoop:
         self.turns += 1
         events = self._events
         begin_ns = since_ns = now_ns = time.monotonic_ns()
+        if begin_ns - self._looked_ns > _LOOK_NS:
+            self._let_other_threads_run(begin_ns)
         length_ns = _TURN_NS
         is_first = True
         while events and not self._is_stopping:
@@ -256,6 +268,12 @@ class RosLoop:
             self._post_turn()
         if self._timers:
             self._check_timers()
+
+    def _let_other_threads_run(self, now_ns: int) -> None:
+        busy_ns = time.thread_time_ns()
+        if busy_ns - self._busy_ns > _MOST_BUSY * (now_ns - self._looked_ns):
+            time.sleep(_GAP_S)
+        self._looked_ns, self._busy_ns = now_ns, busy_ns
 
     def _fair_turn_ns(self, event_ns: int) -> int:
         """The longest turn with an event that took so long."""
