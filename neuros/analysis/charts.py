@@ -470,11 +470,8 @@ def _draw_packets(
 
 def _flights(run: PastRun, name: str, window: tuple[int, int]) -> Numbers | None:
     """Milliseconds of sending and of the start on it, for packets of the window, (n, 2)."""
-    latencies_ns = run.latencies_ns(name)
-    if latencies_ns is None or not len(latencies_ns):
-        return None
-    taken_ns = run.packets[name].taken_ns[: len(latencies_ns)]
-    return _within(np.column_stack([taken_ns - latencies_ns, taken_ns]), window)
+    flights_ns = run.flights_ns(name)
+    return None if flights_ns is None or not len(flights_ns) else _within(flights_ns, window)
 
 
 def _answers(run: PastRun, name: str, window: tuple[int, int]) -> Numbers | None:

@@ -297,18 +297,27 @@ def _compare_connection(
         remarks.append(
             f"{name}: not compared, since {' and '.join(dict.fromkeys(map(str, folders)))} has"
             " neither digests nor a recording of it (the in-process back end keeps digests with"
-            " --digests; packets from a node to itself never have any: record them with -r)"
+            " --digests, and none are kept with --packet-log 0; packets from a node to itself never"
+            " have any: record them with -r)"
         )
         return 0
+    both = in_a, in_b
+    start = max(packets.sent_before for packets in both)
+    ends = [packets.sent_before + len(packets.sent) for packets in both]
+    cut_off = [end for (count, _), end in zip(sent, ends, strict=True) if (count or 0) > end]
+    if start or cut_off:
+        end = max(start, min(cut_off)) if cut_off else None
+        in_a, in_b = (_between(packets, start, end) for packets in both)
+        if start:
+            remarks.append(
+                f"{name}: compared from packet {start + 1} on; the first {start} are not kept"
+                " (--packet-log), nor is it compared what hooks took"
+            )
+        if cut_off:
+            remarks.append(f"{name}: compared up to packet {end}; later packets have no digests")
     compared = _first_difference(in_a.sent, in_b.sent)
-    cut_off = [len(packets.sent) for count, packets in sent if (count or 0) > len(packets.sent)]
-    if cut_off:
-        listed = min(cut_off)
-        in_a, in_b = (replace(packets, sent=packets.sent[:listed]) for packets in (in_a, in_b))
-        remarks.append(f"{name}: compared up to packet {listed}; later packets have no digests")
-        taken = None
-    else:
-        taken = _taken(name, in_a, in_b)
+    is_whole = not (cut_off or in_a.before or in_b.before)
+    taken = _taken(name, in_a, in_b) if is_whole else None
     difference = _sent(name, in_a, in_b)
     if difference is not None:
         found.append(difference)
@@ -341,7 +350,7 @@ def _packets(
         if bag is not None and (have_both or stands_beside):
             # On a reliable connection all of it arrives.
             received = bag if runs[0].ends[name].is_reliable else packets[place].received
-            packets[place] = replace(packets[place], sent=bag, received=received)
+            packets[place] = replace(packets[place], sent=bag, received=received, sent_before=0)
     return packets[0], packets[1]
 
 
@@ -352,16 +361,30 @@ def _lacks_digests(sent: int | None, packets: Packets) -> bool:
     return sent > 0 and not len(packets.sent)
 
 
+def _between(packets: Packets, start: int, end: int | None) -> Packets:
+    """Without what was sent before, or from ``end`` on; both count from 0."""
+    first = start - packets.sent_before
+    count = None if end is None else first + end - start
+    return replace(
+        packets,
+        sent=packets.sent[first:count],
+        sent_ns=packets.sent_ns[first:count],
+        sent_before=min(start, packets.sent_before + len(packets.sent)),
+    )
+
+
 def _sent(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     place = _first_difference(in_a.sent, in_b.sent)
     if place == len(in_a.sent) == len(in_b.sent):
         return None
     at_ns = float(in_a.sent_ns[place]) if place < len(in_a.sent_ns) else np.inf
+    number = in_a.sent_before + place
     if place == len(in_a.sent) or place == len(in_b.sent):
-        shorter, longer = ("A", "B") if len(in_a.sent) < len(in_b.sent) else ("B", "A")
-        text = f"{name}: run {shorter} ends after packet {place}, run {longer} has more"
-        return _Difference(at_ns, f"{text} ({abs(len(in_a.sent) - len(in_b.sent))})")
-    return _Difference(at_ns, f"{name}: packet {place + 1} differs", (name, place + 1))
+        ends = [each.sent_before + len(each.sent) for each in (in_a, in_b)]
+        shorter, longer = ("A", "B") if ends[0] < ends[1] else ("B", "A")
+        text = f"{name}: run {shorter} ends after packet {min(ends)}, run {longer} has more"
+        return _Difference(at_ns, f"{text} ({max(ends) - min(ends)})")
+    return _Difference(at_ns, f"{name}: packet {number + 1} differs", (name, number + 1))
 
 
 def _field(folders: tuple[Path, Path], name: str, number: int, recorded: RecordedPackets) -> str:

@@ -8,6 +8,7 @@ leave their lists in different run folders, and no latency is worked out for the
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,7 @@ from neuros.project.model import Connection
 from neuros.project.scanner import read_bytes
 
 _MOST_HOOKS = 10_000
+_COUNT = re.compile(r"[1-9][0-9]{0,17}")
 FOLDER = "packets"
 PERCENTILES = (50, 90, 99)
 
@@ -38,6 +40,8 @@ class Packets:
         taken: of each that a hook started on, its place among those that arrived, from 1, (taken,).
         taken_ns: when that was, (taken,).
         damaged: files of which the rest is left out, from an entry that no node has written.
+        sent_before, received_before, taken_before: how many entries the node has not kept, which
+            came before the first ones here.
     """
 
     sent_ns: Numbers
@@ -46,39 +50,60 @@ class Packets:
     taken: Numbers
     taken_ns: Numbers
     damaged: tuple[Path, ...] = ()
+    sent_before: int = 0
+    received_before: int = 0
+    taken_before: int = 0
+
+    @property
+    def before(self) -> int:
+        """How many of the first packets some list has not kept; 0: all lists are from the start."""
+        return max(self.sent_before, self.received_before, self.taken_before)
 
     @property
     def consumed(self) -> Numbers:
         """The digests of the packets that hooks have started on, each once, in order."""
-        places = np.unique(self.taken)
-        found: Numbers = self.received[places[places <= len(self.received)] - 1]
+        places = np.unique(self.taken) - self.received_before
+        found: Numbers = self.received[places[_is_in(self.received, places)] - 1]
         return found
 
     @property
     def consumed_ns(self) -> Numbers:
         """When the first hook has started on each packet of :attr:`consumed`."""
         places, firsts = np.unique(self.taken, return_index=True)
-        found: Numbers = self.taken_ns[firsts[places <= len(self.received)]]
+        is_known = _is_in(self.received, places - self.received_before)
+        found: Numbers = self.taken_ns[firsts[is_known]]
         return found
 
-    def latencies_ns(self, *, may_lose: bool) -> Numbers | None:
-        """Nanoseconds from when a packet was sent to each start of a hook on it.
+    def flights_ns(self, *, may_lose: bool) -> Numbers | None:
+        """When a packet was sent, and when a hook started on it: for each start, (starts, 2).
 
         Where packets may be lost on their way, those that arrived are found by their digests among
         those that were sent; ``None`` if that is not possible.
         """
-        places, sent_ns = self.taken - 1, self.sent_ns
+        places, before = self.taken, self.sent_before
+        sent_ns, taken_ns = self.sent_ns, self.taken_ns
         if may_lose:
             which = self._which_arrived()
             if which is None:
                 return None
+            before = self.received_before + len(self.received) - len(which)
             sent_ns = sent_ns[which]
-        is_known = places < len(sent_ns)
-        found: Numbers = self.taken_ns[is_known] - sent_ns[places[is_known]]
-        return found
+        is_known = _is_in(sent_ns, places - before)
+        return np.column_stack([sent_ns[places[is_known] - before - 1], taken_ns[is_known]])
+
+    def latencies_ns(self, *, may_lose: bool) -> Numbers | None:
+        """Nanoseconds from when a packet was sent to each start of a hook on it.
+
+        ``None`` as from :meth:`flights_ns`.
+        """
+        flights_ns = self.flights_ns(may_lose=may_lose)
+        return None if flights_ns is None else flights_ns[:, 1] - flights_ns[:, 0]
 
     def _which_arrived(self) -> Numbers | None:
-        """For each packet that arrived, its place among those that were sent, from 0."""
+        """For each packet that arrived, its place among those that were sent, from 0.
+
+        The first ones that arrived are left out where their sender has not kept them.
+        """
         order = np.argsort(self.sent)
         ordered = self.sent[order]
         if len(ordered) != len(self.sent_ns) or (ordered[1:] == ordered[:-1]).any():
@@ -86,9 +111,13 @@ class Packets:
         found = np.searchsorted(ordered, self.received)
         is_known = found < len(ordered)
         found[~is_known] = 0
-        if not len(ordered) or not (is_known & (ordered[found] == self.received)).all():
+        if not len(ordered):
             return None
-        return order[found]
+        is_known &= ordered[found] == self.received
+        first = int(np.argmax(is_known)) if self.sent_before else 0
+        if not is_known[first:].all():
+            return None
+        return order[found[first:]]
 
 
 def read_packets(run_folder: Path, connection: Connection) -> Packets:
@@ -96,20 +125,50 @@ def read_packets(run_folder: Path, connection: Connection) -> Packets:
     index = connection.index
     sender = _node_folder(run_folder, connection.source_node) / FOLDER
     receiver = _node_folder(run_folder, connection.destination_node) / FOLDER
-    taken = _numbers(receiver / f"{index}.taken", np.int64)
-    good = _up_to_first(taken < 1)
-    damaged = () if good == len(taken) else (receiver / f"{index}.taken",)
-    taken = taken[:good]
-    taken_ns = _numbers(receiver / f"{index}.taken_ns", np.int64)
-    both = min(len(taken), len(taken_ns))
-    return Packets(
-        sent_ns=_numbers(sender / f"{index}.sent_ns", np.int64),
-        sent=_numbers(sender / f"{index}.digests", np.uint64),
-        received=_numbers(receiver / f"{index}.digests", np.uint64),
-        taken=taken[:both],
-        taken_ns=taken_ns[:both],
-        damaged=damaged,
+    taken_before, (taken, taken_ns) = _beside(
+        _list(receiver / f"{index}.taken", np.int64),
+        _list(receiver / f"{index}.taken_ns", np.int64),
     )
+    both = min(len(taken), len(taken_ns))
+    good = _up_to_first(taken[:both] < 1)
+    damaged = () if good == both else (receiver / f"{index}.taken",)
+    sent_before, (sent_ns, sent) = _beside(
+        _list(sender / f"{index}.sent_ns", np.int64), _list(sender / f"{index}.digests", np.uint64)
+    )
+    received_before, received = _list(receiver / f"{index}.digests", np.uint64)
+    return Packets(
+        sent_ns=sent_ns,
+        sent=sent,
+        received=received,
+        taken=taken[:good],
+        taken_ns=taken_ns[:good],
+        damaged=damaged,
+        sent_before=sent_before,
+        received_before=received_before,
+        taken_before=taken_before,
+    )
+
+
+def _beside(*lists: tuple[int, Numbers]) -> tuple[int, list[Numbers]]:
+    """Lists of the same packets from the first one that all have; not all need be kept."""
+    before = max((before for before, numbers in lists if len(numbers)), default=0)
+    return before, [numbers[before - its_before :] for its_before, numbers in lists]
+
+
+def _list(file: Path, kind: Any) -> tuple[int, Numbers]:
+    """How many entries of a list were not kept, and the others; of files without a gap."""
+    found, end = [_numbers(file, kind)], 0
+    before = 0
+    if not len(found[0]):  # it has gone, or there never was one
+        names = (
+            each.name.removeprefix(f"{file.name}.") for each in file.parent.glob(f"{file.name}.*")
+        )
+        before = min((int(name) for name in names if _COUNT.fullmatch(name)), default=0)
+    end = before + len(found[0])
+    while end and len(more := _numbers(file.with_name(f"{file.name}.{end}"), kind)):
+        found.append(more)
+        end += len(more)
+    return before, found[0] if len(found) == 1 else np.concatenate(found)
 
 
 def _node_folder(run_folder: Path, node: str) -> Path:
@@ -123,7 +182,8 @@ def _node_folder(run_folder: Path, node: str) -> Path:
 def packet_figures(packets: Packets, *, may_lose: bool) -> dict[str, Any]:
     """Latency and digests of a connection, ready for JSON.
 
-    ``latency_ms`` is ``None`` where it cannot be told, ``digests`` where none were kept.
+    ``latency_ms`` is ``None`` where it cannot be told, ``digests`` where none were kept, or not
+    those of the first packets.
     """
     return {"latency_ms": _latency_ms(packets, may_lose), "digests": _digests(packets)}
 
@@ -141,7 +201,7 @@ def _latency_ms(packets: Packets, may_lose: bool) -> dict[str, float] | None:
 
 
 def _digests(packets: Packets) -> dict[str, Any] | None:
-    if not len(packets.sent) and not len(packets.received):
+    if not (len(packets.sent) or len(packets.received)) or packets.before:
         return None
     consumed = packets.consumed
     return {
@@ -205,6 +265,12 @@ def read_trace(folder: Path) -> Trace:
     which, starts_ns, ends_ns = executions.T
     arrivals = _numbers(folder / "credits", np.int64, 3)
     return Trace(tuple(names), which, starts_ns, ends_ns, arrivals, damaged)
+
+
+def _is_in(numbers: Numbers, places: Numbers) -> Numbers:
+    """Which places, from 1, are of one of the numbers."""
+    found: Numbers = (places >= 1) & (places <= len(numbers))
+    return found
 
 
 def _up_to_first(wrong: Numbers) -> int:

@@ -269,12 +269,17 @@ class PastRun:
 
         return {name: read_packets(self.folder, end) for name, end in self.ends.items()}
 
-    def latencies_ns(self, connection: str) -> Numbers | None:
-        """Nanoseconds from the sending of a packet to each start of a hook on it, if known."""
+    def flights_ns(self, connection: str) -> Numbers | None:
+        """When a packet was sent, and when a hook started on it, for each start, if known."""
         from neuros.analysis.packets import may_have_lost
 
         may_lose = may_have_lost(self.connections[connection])
-        return self.packets[connection].latencies_ns(may_lose=may_lose)
+        return self.packets[connection].flights_ns(may_lose=may_lose)
+
+    def latencies_ns(self, connection: str) -> Numbers | None:
+        """Nanoseconds from the sending of a packet to each start of a hook on it, if known."""
+        flights_ns = self.flights_ns(connection)
+        return None if flights_ns is None else flights_ns[:, 1] - flights_ns[:, 0]
 
     @cached_property
     def traces(self) -> dict[str, Trace]:
@@ -378,8 +383,10 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
     check_record(record, folder / "project.json")
     for figures in connections:
         packets = read_packets(folder, _connection_of(figures))
-        sent, received = len(packets.sent_ns), len(packets.received)
-        figures |= {"sent": sent, "received": received, "consumed": len({*packets.taken.tolist()})}
+        figures["sent"] = packets.sent_before + len(packets.sent_ns)
+        figures["received"] = packets.received_before + len(packets.received)
+        if not packets.taken_before:  # several hooks may have started on one that is not listed
+            figures["consumed"] = len({*packets.taken.tolist()})
         figures |= packet_figures(packets, may_lose=may_have_lost(figures))
     return record, [
         "run.json: the run goes on, or its launcher was killed. Packets are counted from the"
@@ -398,8 +405,16 @@ def _missing_lists(run: PastRun) -> list[str]:
     if not (run.folder / FILE_NAME).is_file():
         missing.append("processor and memory: the run was made without -m")
     read_load(run.folder / FILE_NAME, missing.append)
-    if not any(len(packets.sent_ns) for packets in run.packets.values()) and run.connections:
+    if (run.record.get("options") or {}).get("packet_log") == "0":
+        missing.append("times of single packets: the run was made with --packet-log 0")
+    elif not any(len(packets.sent_ns) for packets in run.packets.values()) and run.connections:
         missing.append("times of single packets: no node has listed any")
+    missing += [
+        f"times and digests of the first {each.before} packets of {name}: they are not kept"
+        " (--packet-log)"
+        for name, each in run.packets.items()
+        if each.before
+    ]
     if not run.traces and run.nodes:
         missing.append("the first executions of hooks: no node has listed any")
     damaged = [file for packets in run.packets.values() for file in packets.damaged]

@@ -38,6 +38,7 @@ from neuros.transport.dds_profile import (
 
 _HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")  # RFC 1123
 _ON_MACHINES = "process"
+_LISTS = 5  # of packets for each connection, at both ends: see neuros.node.logs
 """The back end of nodes on other machines, and of all nodes of a deployment."""
 _LOOKS_LIKE_AN_ADDRESS = re.compile(r"[\d.]+")
 
@@ -185,7 +186,13 @@ class Plan:
         """One ``node.json`` per node that is to be started."""
         files = split(self.project, lambda _: folders)
         paths = self.messages.paths if self.messages else ()
-        return [replace(f, messages=paths) for f in files if f.node.name in self.names]
+        lists = _LISTS * max(1, len(self.project.connections))
+        list_bytes = self.request.packet_log_bytes // lists
+        return [
+            replace(f, messages=paths, list_bytes=list_bytes)
+            for f in files
+            if f.node.name in self.names
+        ]
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
         """The launcher of the back end; ``reaper`` hears of all it starts."""

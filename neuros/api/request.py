@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 from neuros.errors import UsageError
 from neuros.options import like, option, options_of, positive_number, positive_seconds
+from neuros.project.model import bytes_of
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -199,6 +200,15 @@ class Request(ProjectOptions):
         " digests only if all connections are lossless and digests take under 2 %% of the"
         " processor time",
     )
+    packet_log: str = option(
+        "--packet-log",
+        default="1g",
+        metavar="SIZE",
+        page="command_line.md#latency-and-digests",
+        help="keep times and digests of the newest packets, in files of at most this size for the"
+        " whole run, such as 512m or 2g; 0 keeps none, so that there is no latency and nothing for"
+        " `neuros verify`",
+    )
     record: bool | Sequence[str] = option(
         "-r",
         "--record",
@@ -255,12 +265,25 @@ class Request(ProjectOptions):
                 object.__setattr__(self, each.name, (given,))
             elif given is None and each.variable:
                 object.__setattr__(self, each.name, each.value(None))
-        _ = self.end, self.recording  # raise what is wrong with them
+        _ = self.end, self.recording, self.packet_log_bytes  # raise what is wrong with them
 
     @property
     def end(self) -> Duration:
         """When to end the run."""
         return parse_duration(self.duration)
+
+    @property
+    def packet_log_bytes(self) -> int:
+        """So much the packet logs of all nodes have together at most; 0: none is kept."""
+        if self.packet_log == "0" and self.digests:
+            raise UsageError("--digests: --packet-log 0 keeps no digests; leave one of them out")
+        try:
+            return 0 if self.packet_log == "0" else bytes_of(self.packet_log)
+        except ValueError:
+            raise UsageError(
+                f"--packet-log {self.packet_log}: give a whole number and its unit (k, m, g), as in"
+                " 512m or 2g, or 0 for none"
+            ) from None
 
     @property
     def recording(self) -> RecordingRequest | None:

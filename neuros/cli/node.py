@@ -6,14 +6,12 @@ import argparse
 import atexit
 import contextlib
 import ctypes
-import errno
 import faulthandler
 import gc
 import io
 import json
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -22,6 +20,7 @@ from typing import Any
 from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener, connect_by
 from neuros.errors import EnvironmentFault
 from neuros.node.process import NodeProcess
+from neuros.ordinary_files import leave_out_what_has_no_room
 from neuros.ports import ControlListener, Middleware, PacketRecorder
 from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
@@ -55,7 +54,7 @@ def _run_node(options: argparse.Namespace) -> int:
     atexit.register(leave)  # first, so that it comes last, after what plugins have registered
     faulthandler.enable()  # a plugin that crashes in C leaves its Python stack in the log
     for name in ("stdout", "stderr"):
-        _leave_out_what_has_no_room(name)
+        leave_out_what_has_no_room(name)
     files = node_files_from_json(json.loads(Path(p).read_text()) for p in options.node_files)
     # ROS tools started by a plugin must find the same ROS, so only the guard is taken away.
     os.environ.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
@@ -100,34 +99,6 @@ def _session_listener(run_folder: Path) -> ControlListener | None:
     except EnvironmentFault:
         return None
     return listener
-
-
-class _Log(io.FileIO):
-    """The log of a node: where the disk is full it goes without, and no ``print`` fails."""
-
-    def write(self, data: Any, /) -> int:
-        try:
-            return super().write(data)
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            return memoryview(data).nbytes
-
-
-def _leave_out_what_has_no_room(name: str) -> None:
-    """Let ``sys.stdout`` or ``sys.stderr`` write as before, but never fail for want of room."""
-    stream = getattr(sys, name)
-    log = _Log(stream.fileno(), "w", closefd=False)
-    is_raw = isinstance(stream.buffer, io.RawIOBase)
-    made = io.TextIOWrapper(
-        log if is_raw else io.BufferedWriter(log),
-        stream.encoding,
-        stream.errors,
-        line_buffering=stream.line_buffering,
-        write_through=stream.write_through,
-    )
-    setattr(sys, name, made)
-    setattr(sys, f"__{name}__", made)
 
 
 def _recorders(run: Path) -> Callable[[NodeFile], PacketRecorder]:

@@ -2,7 +2,7 @@
 
 The packet log says when each packet was sent and taken, and has its digest.
 
-``<node>/packets/<index of the connection>.<what>`` are files of 8-byte numbers, in the byte order
+``<node>/packets/<index of the connection>.<what>`` are lists of 8-byte numbers, in the byte order
 of the machine, one per packet:
 
 ========= ==========================================================================
@@ -11,6 +11,10 @@ digests   at the sender: of each packet sent; at the receiver: of each received
 taken     at the receiver: the position (from 1) of a packet that a hook has started on
 taken_ns  when that was
 ========= ==========================================================================
+
+A list that has filled a quarter of its room goes on in another file, whose name ends with the
+number of entries before it, as ``3.sent_ns.524288``. With four files full, the oldest one goes. In
+a recorded run a list ends instead, since a replay begins at the start.
 
 ``<node>/packets/executions`` has the first executions of the node's hooks (the place of the hook in
 ``hooks.json``, start and end), ``credits`` the acknowledgements that arrived meanwhile (index of
@@ -47,8 +51,43 @@ from neuros.project.model import Connection
 FOLDER = "packets"
 EVENT_LOG = "event_log"
 
-MOST_ENTRIES = 8_000_000
-"""Of a file, 64 MB; what comes later is counted and not listed."""
+MOST_BYTES = 64_000_000
+"""Of the event log, which is 8 million entries; what comes later is left out."""
+_FILES = 4
+
+
+class _List:
+    """A list of 8-byte numbers in files, which have ``most_bytes`` together.
+
+    ``keeps_first``: with no room left, the newest entries are left out, and not the oldest.
+    """
+
+    def __init__(self, file: Path, most_bytes: int, *, keeps_first: bool) -> None:
+        self._file = file
+        self._keeps_first = keeps_first
+        self._file_bytes = max(8, most_bytes // (1 if keeps_first else _FILES) // 8 * 8)
+        self._files = [file]
+        self._room = self._file_bytes  # in the newest file
+        self._written = 0
+
+    def append(self, data: bytes) -> None:
+        """Write entries. Raises ``OSError``."""
+        while data:
+            if not self._room:
+                if self._keeps_first:
+                    return
+                self._begin_file()
+            part, data = data[: self._room], data[self._room :]
+            with open(self._files[-1], "ab") as file:
+                file.write(part)
+            self._room -= len(part)
+            self._written += len(part)
+
+    def _begin_file(self) -> None:
+        if len(self._files) == _FILES:
+            self._files.pop(0).unlink(missing_ok=True)
+        self._files.append(self._file.with_name(f"{self._file.name}.{self._written // 8}"))
+        self._room = self._file_bytes
 
 
 class PacketLog:
@@ -57,18 +96,24 @@ class PacketLog:
     Args:
         folder: the node's own.
         digests: by connection, those since they were last written; empty if there are none.
+        list_bytes: so much each list of packets has at most; 0: only the event log is written.
 
     Attributes:
         failure: why nothing more is written, ``None`` while all is well.
     """
 
     def __init__(
-        self, engine: Engine, digests: Mapping[Connection, array[int]], folder: Path
+        self,
+        engine: Engine,
+        digests: Mapping[Connection, array[int]],
+        folder: Path,
+        list_bytes: int = MOST_BYTES,
     ) -> None:
         self._engine = engine
         self._digests = digests
         self._folder = folder / FOLDER
-        self._written: dict[str, int] = {}
+        self._list_bytes = list_bytes
+        self._lists: dict[str, _List] = {}
         self._hooks_written = 0
         self._lock = threading.Lock()
         self.failure: str | None = None
@@ -77,7 +122,7 @@ class PacketLog:
         """Give up what has been written: the node was reset, and has this engine now."""
         with self._lock:
             self._engine = engine
-            self._written.clear()
+            self._lists.clear()
             self._hooks_written = 0
             for digests in self._digests.values():
                 del digests[:]
@@ -91,9 +136,10 @@ class PacketLog:
                 count = len(entries)
                 data = entries[:count].tobytes()
                 del entries[:count]
-                if data and name and self.failure is None:
+                is_kept = self._list_bytes or name == EVENT_LOG
+                if data and name and is_kept and self.failure is None:
                     self._append(name, data)
-            hooks = self._engine.execution_log.hooks[:]
+            hooks = self._engine.execution_log.hooks[:] if self._list_bytes else []
             if len(hooks) > self._hooks_written and self.failure is None:
                 self._hooks_written = len(hooks)
                 self._write_hooks(hooks)
@@ -114,15 +160,18 @@ class PacketLog:
             yield f"{connection.index}.digests", digests
 
     def _append(self, name: str, data: bytes) -> None:
-        room = MOST_ENTRIES * 8 - self._written.get(name, 0)
-        data = data[: max(0, room)]
+        if name not in self._lists:
+            is_of_packets = "." in name
+            self._lists[name] = _List(
+                self._folder / name,
+                self._list_bytes if is_of_packets else MOST_BYTES,
+                keeps_first=not is_of_packets or isinstance(self._engine, LoggedEngine),
+            )
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            with open(self._folder / name, "ab") as file:
-                file.write(data)
+            self._lists[name].append(data)
         except OSError as error:
             self._fail(error)
-        self._written[name] = self._written.get(name, 0) + len(data)
 
     def _write_hooks(self, hooks: list[tuple[str, str]]) -> None:
         text = json.dumps([{"name": name, "kind": kind} for name, kind in hooks])

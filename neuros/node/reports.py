@@ -44,7 +44,7 @@ class NodeReports:
         """There is an engine to report of; what is special about it is logged."""
         self._engine = engine
         folder = self._file.folders.run / self._file.node.name
-        self._packet_log = PacketLog(engine, self._transport.digests, folder)
+        self._packet_log = PacketLog(engine, self._transport.digests, folder, self._file.list_bytes)
         for hook in engine.free_running_hooks():
             logger.info(f"hook '{hook.name}' requires no input: it runs without pause")
         for subscription in engine.untaken_subscriptions():

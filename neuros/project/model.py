@@ -6,6 +6,7 @@ Everything here is frozen. :mod:`neuros.project.load` reads it from files,
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -259,6 +260,7 @@ class NodeFile:
         names: the project's.
         keys: by index of a connection, a secret of its two nodes, hexadecimal. None where one of
             them is another launcher's.
+        list_bytes: so much each list of its packet log has at most; 0: it keeps none.
     """
 
     node: Node
@@ -268,6 +270,7 @@ class NodeFile:
     messages: tuple[Path, ...] = ()
     names: Names = _NO_NAMES
     keys: Mapping[int, str] = field(default_factory=dict, hash=False, repr=False)
+    list_bytes: int = 64_000_000
 
 
 @dataclass(frozen=True)
@@ -323,12 +326,19 @@ def memory_text(mem_bytes: int) -> str:
     return f"{-(-mem_bytes // _UNITS['k'])}k"
 
 
+def bytes_of(text: str) -> int:
+    """An amount as project files write it, ``2g`` or ``512m``, in bytes. Raises ``ValueError``."""
+    if not re.fullmatch(r"[1-9][0-9]{0,8}[kmg]", text):
+        raise ValueError(text)
+    return int(text[:-1]) * _UNITS[text[-1]]
+
+
 def resources_of(keys: Mapping[str, Any]) -> Resources:
     """The limits that valid keys of a node set."""
     given = keys.get("resources", {})
     memory, cpus, pids = (given.get(key) for key in ("memory", "cpus", "pids"))
     return Resources(
-        mem_bytes=None if memory is None else int(memory[:-1]) * _UNITS[memory[-1]],
+        mem_bytes=None if memory is None else bytes_of(memory),
         cpus=None if cpus is None else float(cpus),
         pids=None if pids is None else int(pids),
     )

@@ -213,7 +213,8 @@ class ReplayedNode:
         data = self._recorded.arrived(key, number)
         if data is None:
             self.notes.append(
-                f"the bag ends before packet {number} that arrived on {key}: the replay ends there"
+                f"the record ends before packet {number} that arrived on {key}: the replay ends"
+                " there"
             )
             self._is_cut_off = True
             raise ReplayOver

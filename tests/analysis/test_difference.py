@@ -307,3 +307,45 @@ def test_a_run_in_parts_is_compared_as_a_whole(folders: tuple[Path, Path]) -> No
     difference = compare(a, open_whole(parts), Bags()).difference
     assert difference is not None
     assert difference.startswith(f"{FIRST}: packet 3 differs")
+
+
+def forget_the_first(folder: Path, count: int, *, ends: str = "ab") -> None:
+    """Have the lists of the first connection begin later, as those of a long run do."""
+    for node in ends:
+        for file in (folder / node / "packets").glob("0.*"):
+            numbers = file.read_bytes()
+            file.unlink()
+            file.with_name(f"{file.name}.{count}").write_bytes(numbers[8 * count :])
+
+
+def test_packets_are_compared_from_the_first_that_both_runs_have_kept(
+    folders: tuple[Path, Path],
+) -> None:
+    a = run(folders[0], {FIRST: [7, 2, 3, 4]})
+    b = run(folders[1], {FIRST: [1, 2, 3, 4]})
+    forget_the_first(folders[0], 1)
+    forget_the_first(folders[1], 2)
+    found = verdict(a, b)
+    assert (found.difference, found.compared) == (None, 2)
+    assert "compared from packet 3 on; the first 2 are not kept" in " ".join(found.remarks)
+
+
+def test_a_difference_behind_packets_that_are_not_kept_has_its_number(
+    folders: tuple[Path, Path],
+) -> None:
+    a = run(folders[0], {FIRST: [1, 2, 3, 4, 5]})
+    b = run(folders[1], {FIRST: [1, 2, 3, 9]})
+    forget_the_first(folders[1], 2)
+    found = verdict(a, b)
+    assert found.difference is not None
+    assert found.difference.startswith(f"{FIRST}: packet 4 differs")
+    assert found.compared == 1
+
+
+def test_a_run_that_ends_before_what_the_other_has_kept_is_different(
+    folders: tuple[Path, Path],
+) -> None:
+    a = run(folders[0], {FIRST: [1, 2]})
+    b = run(folders[1], {FIRST: [1, 2, 3, 4]})
+    forget_the_first(folders[1], 3)
+    assert verdict(a, b).difference == f"{FIRST}: run A ends after packet 2, run B has more (2)"

@@ -107,3 +107,41 @@ def test_files_are_read_as_far_as_they_were_written(tmp_path: Path) -> None:
     found = read_packets(tmp_path, connection)
     assert list(found.latencies_ns(may_lose=False)) == [3]
     assert len(found.sent) == len(found.received) == 0
+
+
+def without_the_first(found: Packets, sent: int, received: int, taken: int) -> Packets:
+    """The lists of a run that has not kept so many entries of each."""
+    return Packets(
+        found.sent_ns[sent:],
+        found.sent[sent:],
+        found.received[received:],
+        found.taken[taken:],
+        found.taken_ns[taken:],
+        sent_before=sent,
+        received_before=received,
+        taken_before=taken,
+    )
+
+
+@pytest.mark.parametrize("sent", [0, 1, 2])
+@pytest.mark.parametrize("received", [0, 1, 2])
+@pytest.mark.parametrize("taken", [0, 1, 2])
+def test_latencies_are_those_of_the_packets_that_both_ends_have_kept(
+    sent: int, received: int, taken: int
+) -> None:
+    lossless = packets([10, 20, 30], [9, 8, 7], [9, 8, 7], taken=[1, 2, 3], taken_ms=[11, 25, 37])
+    found = without_the_first(lossless, sent, received, taken)
+    assert latencies_ms(found, may_lose=False) == [1, 5, 7][max(sent, taken) :]
+    assert found.consumed.tolist() == [9, 8, 7][max(received, taken) :]
+    lossy = packets(
+        [10, 15, 20, 30], [9, 5, 8, 7], [9, 8, 7], taken=[1, 2, 3], taken_ms=[11, 25, 37]
+    )
+    found = without_the_first(lossy, sent + (sent == 2), received, taken)
+    assert latencies_ms(found, may_lose=True) == [1, 5, 7][max(sent, received, taken) :]
+
+
+def test_a_digest_of_all_packets_is_none_where_the_first_are_not_kept() -> None:
+    whole = packets([1, 2], [9, 8], [9, 8], taken=[1, 2], taken_ms=[5, 6])
+    figures = packet_figures(without_the_first(whole, 1, 0, 0), may_lose=False)
+    assert figures["digests"] is None
+    assert figures["latency_ms"]["count"] == 1

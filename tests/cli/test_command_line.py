@@ -345,9 +345,9 @@ def test_ctrl_c_without_a_run_is_no_traceback(
 
 PRINTS = """
 import sys
-from neuros.cli.node import _leave_out_what_has_no_room
+from neuros.ordinary_files import leave_out_what_has_no_room
 for name in ("stdout", "stderr"):
-    _leave_out_what_has_no_room(name)
+    leave_out_what_has_no_room(name)
     print("said on", name, file=getattr(sys, name))
     getattr(sys, name).flush()
 """
@@ -484,3 +484,16 @@ def test_what_could_not_be_started_is_recorded_and_leaves_nothing(
     assert "Traceback" not in output.err
     assert output.err.startswith("neuros: the reaper process cannot be started: ")
     assert not Path("out/control.sock").exists()
+
+
+@pytest.mark.parametrize("size", ["1", "2GB", "-1m", "0m", "much"])
+def test_a_size_of_the_packet_log_has_a_unit(
+    project: Path, size: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["launch", ".", f"--packet-log={size}"]) == 2
+    assert f"--packet-log {size}: give a whole number and its unit" in capsys.readouterr().err
+
+
+def test_digests_need_a_packet_log(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["launch", ".", "--digests", "--packet-log", "0"]) == 2
+    assert "--packet-log 0 keeps no digests" in capsys.readouterr().err

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
-from launching import EXAMPLES, Finished, launch
+from launching import BACKENDS, EXAMPLES, Finished, launch
+from replaying import replay
 
 from neuros.cli.main import main
 
@@ -162,3 +164,92 @@ def test_latencies_are_there_with_and_without_digests(reference: Finished) -> No
         latency_ms = connection["latency_ms"]
         assert 0 < latency_ms["p50"] <= latency_ms["p90"] <= latency_ms["p99"] <= latency_ms["max"]
         assert latency_ms["count"] == connection["consumed"]
+
+
+TICKS = 150
+
+
+def ticking(folder: Path) -> Path:
+    """A node that sends numbers to another one, without loss, and ends the run."""
+    (folder / "a.py").write_text(
+        "from neuros.hooks import neuros_function\n"
+        "@neuros_function(outputs='out')\n"
+        "def send(node, count=[0]):\n"
+        "    count[0] += 1\n"
+        f"    if count[0] == {TICKS}:\n"
+        "        node.shutdown('done')\n"
+        "    number = node.make_packet('out')\n"
+        "    number.data = count[0]\n"
+        "    return number\n"
+    )
+    (folder / "b.py").write_text(
+        "from neuros.hooks import neuros_function\n"
+        "@neuros_function(inputs='in')\n"
+        "def take(node, number):\n"
+        "    pass\n"
+    )
+    number, container = {"type": "std_msgs/msg/Int32"}, {"container": "neuros_python"}
+    connection = {"source_node": "a", "source_output": "out", "destination_node": "b"}
+    project = {
+        "nodes": [
+            {**container, "name": "a", "plugin": "a.py", "outputs": [{**number, "name": "out"}]},
+            {**container, "name": "b", "plugin": "b.py", "inputs": [{**number, "name": "in"}]},
+        ],
+        "connections": [{**connection, "destination_input": "in", "discard_limit": 0}],
+    }
+    (folder / "project.json").write_text(json.dumps(project))
+    return folder
+
+
+@pytest.mark.parametrize("back_end", BACKENDS)
+def test_a_long_run_keeps_the_newest_packets_and_every_command_says_so(
+    tmp_path: Path, back_end: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    project, size = ticking(tmp_path), 4096
+    for name in ("first", "second"):
+        options = ("--digests", "--packet-log", "4k", "-o", str(tmp_path / name))
+        finished = launch(project, "--backend", back_end, *options, cwd=tmp_path)
+        assert finished.exit_code == 0, finished.output
+        (connection,) = json.loads((tmp_path / name / "run.json").read_text())["connections"]
+        counts = [connection[key] for key in ("sent", "received", "consumed", "lost")]
+        assert counts == [TICKS, TICKS, TICKS, 0]
+        lists = list(tmp_path.glob(f"{name}/*/packets/0.*"))
+        assert 0 < sum(file.stat().st_size for file in lists) <= size
+        assert 0 < connection["latency_ms"]["count"] < TICKS
+    first, second = str(tmp_path / "first"), str(tmp_path / "second")
+    assert main(["verify", first, second]) == 0
+    said = capsys.readouterr().out
+    assert "are not kept (--packet-log)" in said
+    assert re.search(r"^identical: \d+ packets$", said, re.MULTILINE)
+    assert main(["report", first]) == 0
+    assert "packets of a.out -> b.in: they are not kept" in capsys.readouterr().out
+    assert main(["compare", first, second]) == 0
+    assert re.search(rf"sent +{TICKS} +{TICKS}", capsys.readouterr().out)
+
+
+@pytest.mark.parametrize("back_end", BACKENDS)
+def test_without_a_packet_log_the_table_is_right_and_there_is_nothing_to_verify(
+    tmp_path: Path, back_end: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--packet-log", "0", "-o", str(tmp_path / "run"))
+    finished = launch(ticking(tmp_path), "--backend", back_end, *options, cwd=tmp_path)
+    assert finished.exit_code == 0, finished.output
+    assert not [*tmp_path.glob("run/*/packets")]
+    (connection,) = json.loads((tmp_path / "run/run.json").read_text())["connections"]
+    assert (connection["sent"], connection["consumed"]) == (TICKS, TICKS)
+    assert (connection["latency_ms"], connection["digests"]) == (None, None)
+    run = str(tmp_path / "run")
+    assert main(["verify", run, run]) == 2
+    assert "--packet-log 0" in capsys.readouterr().out
+    assert main(["report", run]) == 0
+    assert "the run was made with --packet-log 0" in capsys.readouterr().out
+
+
+def test_a_recorded_run_without_a_packet_log_can_be_replayed(tmp_path: Path) -> None:
+    options = ("-r", "--packet-log", "0", "-o", str(tmp_path / "run"))
+    finished = launch(ticking(tmp_path), *options, cwd=tmp_path)
+    assert finished.exit_code == 0, finished.output
+    assert {file.name for file in tmp_path.glob("run/*/packets/*")} == {"event_log"}
+    replayed = replay(tmp_path / "run", "a")
+    assert replayed.returncode == 0, replayed.stderr
+    assert f"{TICKS} packets" in replayed.stdout

@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 
+from neuros.analysis.packets import read_packets
+from neuros.engine.event_log import LoggedEngine
 from neuros.engine.hook import Hook
 from neuros.engine.input_queue import Subscription
 from neuros.engine.schedule import ExecutionLog
 from neuros.engine.send_window import SendWindow
 from neuros.hooks import HookKind, HookSpec
-from neuros.node import logs
 from neuros.node.logs import PacketLog
 from neuros.project.model import Connection
 
@@ -82,27 +83,64 @@ def test_of_external_topics_nothing_is_kept(tmp_path: Path, node: Any) -> None:
 def test_first_executions_are_written_with_the_names_of_their_hooks(
     tmp_path: Path, node: Any
 ) -> None:
-    hook = Hook(HookSpec(HookKind.FUNCTION, test_a_file_does_not_grow_for_ever, (), ()), (), {})
+    hook = Hook(HookSpec(HookKind.FUNCTION, numbers, (), ()), (), {})
     node.execution_log.note_execution(hook, 100, 250)
     node.execution_log.note_credit(LEAVING, 1, 300)
     PacketLog(node, {}, tmp_path).write()
     assert numbers(tmp_path, "executions") == [0, 100, 250]
     assert numbers(tmp_path, "credits") == [3, 1, 300]
     assert json.loads((tmp_path / "packets/hooks.json").read_text()) == [
-        {"name": "test_a_file_does_not_grow_for_ever", "kind": "function"}
+        {"name": "numbers", "kind": "function"}
     ]
     assert not node.execution_log.executions
 
 
-def test_a_file_does_not_grow_for_ever(
-    tmp_path: Path, node: Any, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("at_once", [1, 3, 50])
+def test_a_list_keeps_the_newest_packets_and_no_more_than_it_may(
+    tmp_path: Path, node: Any, at_once: int
 ) -> None:
-    monkeypatch.setattr(logs, "MOST_ENTRIES", 2)
-    log = PacketLog(node, {}, tmp_path)
+    digests = {ARRIVING: array("Q")}
+    log = PacketLog(node, digests, tmp_path, list_bytes=8 * 8)
+    arrived = node.subscriptions[ARRIVING]
+    for number in range(1, 51):
+        node.send_windows[LEAVING].spend(1000 + number)
+        digests[ARRIVING].append(number)
+        arrived.taken.append(number)
+        arrived.taken_ns.append(2000 + number)
+        if number % at_once == 0:
+            log.write()
+            assert sum(f.stat().st_size for f in (tmp_path / "packets").iterdir()) <= 4 * 8 * 8
+    log.write()
+    (tmp_path / "node").mkdir()
+    (tmp_path / "packets").rename(tmp_path / "node/packets")
+    (tmp_path / "node/node.json").touch()
+    sent, received = (read_packets(tmp_path, each) for each in (LEAVING, ARRIVING))
+    assert sent.sent_before == received.received_before == received.taken_before == 42
+    assert sent.sent_ns.tolist() == [*range(1043, 1051)]
+    assert received.taken.tolist() == received.received.tolist() == [*range(43, 51)]
+    assert received.consumed.tolist() == [*range(43, 51)]
+    assert received.consumed_ns.tolist() == [*range(2043, 2051)]
+
+
+def test_in_a_recorded_run_a_list_keeps_the_first_packets(tmp_path: Path, node: Any) -> None:
+    recorded = LoggedEngine.__new__(LoggedEngine)
+    vars(recorded).update(vars(node), event_log=array("q", [-1, -2, -3]))
+    log = PacketLog(recorded, {}, tmp_path, list_bytes=16)
     for time_ns in (1, 2, 3):
         node.send_windows[LEAVING].spend(time_ns)
         log.write()
     assert numbers(tmp_path, "3.sent_ns") == [1, 2]
+    assert numbers(tmp_path, "event_log") == [-1, -2, -3]
+    assert not node.send_windows[LEAVING].sent_ns
+
+
+def test_no_list_is_kept_where_none_is_wanted(tmp_path: Path, node: Any) -> None:
+    log = PacketLog(node, {LEAVING: array("Q", [7])}, tmp_path, list_bytes=0)
+    node.send_windows[LEAVING].spend(1)
+    hook = Hook(HookSpec(HookKind.FUNCTION, numbers, (), ()), (), {})
+    node.execution_log.note_execution(hook, 100, 250)
+    log.write()
+    assert list(tmp_path.iterdir()) == []
     assert not node.send_windows[LEAVING].sent_ns
 
 

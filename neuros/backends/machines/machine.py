@@ -495,7 +495,9 @@ class ClockOffset:
             return
         at_s, ahead_s, _ = zip(*self._course, strict=True)
         for file in sorted(folder.glob("*")):
-            width, columns = _TIMES.get(file.name.rpartition(".")[2], (1, ()))
+            # As 3.taken_ns, or 3.taken_ns.524288 with what came later.
+            what = next((part for part in file.name.split(".") if part in _TIMES), "")
+            width, columns = _TIMES.get(what, (1, ()))
             if columns:
                 with open_itself(file) as written:
                     data = written.read()
