@@ -66,6 +66,8 @@ class Problem:
         hint = f" ({self.hint})" if self.hint else ""
         pointer = f"{self.pointer}: " if self.pointer else ""
         place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+        if self.file.startswith("--") and self.line == 1:  # an option has but one line
+            place = f"{self.file}: character {self.column}"
         return f"{place}: {pointer}{self.text}{hint}"
 
 

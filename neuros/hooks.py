@@ -15,11 +15,15 @@ Example::
 
 from __future__ import annotations
 
+import atexit
 import inspect
 import math
+import os
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cache
 from types import MappingProxyType
 from typing import Any, TypeAlias, TypeVar
 
@@ -41,6 +45,8 @@ __all__ = [
 ]
 
 _MARK = "__neuros_hooks__"
+_RUNNERS = {"neuros.api.project", "neuros.node.node", "neuros.testing.harness"}
+"""What runs hooks: a program that has loaded one of these is no plugin alone."""
 
 
 @dataclass(frozen=True)
@@ -224,11 +230,29 @@ def _marker(
         ):
             for name in sorted({name for name in names if names.count(name) > 1}):
                 raise fail(f"{side} '{name}' is named twice")
+        if function.__module__ == "__main__":
+            _note_program(getattr(sys.modules["__main__"], "__file__", None))
         # A function may carry several marks; the uppermost decorator is applied last.
         setattr(function, _MARK, (spec, *_marks(function)))
         return function
 
     return mark
+
+
+@cache
+def _note_program(file: str | None) -> None:
+    """A plugin is run as a program: at its end it says that this only defines functions."""
+    if file is not None:
+        atexit.register(_say_how_to_run, file)
+
+
+def _say_how_to_run(file: str) -> None:
+    if not _RUNNERS & sys.modules.keys():
+        print(
+            f"{file} is a plugin: by itself it only defines hooks, and none has run. Run the"
+            f" project that names it: neuros launch {os.path.dirname(file) or '.'}",
+            file=sys.stderr,
+        )
 
 
 def _listed(ports: Ports, fail: Callable[[str], HookError]) -> list[Port]:

@@ -13,19 +13,21 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from neuros.api.plan import make_environments
-from neuros.backends.containers import find_container, misspelt
+from neuros.backends.containers import BASE, OWN_FOLDER, find_container, why_no_container
 from neuros.backends.node_command import signal_in_words, without_mark
 from neuros.backends.pythons import Pythons
 from neuros.distribution import WORKSPACE, install_command
-from neuros.errors import Problem, ProjectError, UsageError
+from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project
+from neuros.project.loops import Loops, modules_beside
 from neuros.project.message_types import unknown_type
 from neuros.project.model import NETWORK, NETWORK_MODULE, Node, Project
-from neuros.project.paths import why_no_module
+from neuros.project.paths import is_missing, modules_here, why_no_module
 from neuros.project.plugin_files import PluginFile, read_plugin
 from neuros.project.scanner import display_name, problem_in
+from neuros.project.suggest import did_you_mean
 from neuros.recording.provenance import seeds
 
 _LONG_BYTES = 1 << 20
@@ -66,10 +68,10 @@ def load_with_messages(
     if problems := [problem for node in nodes for problem in _network_problems(node)]:
         raise ProjectError(problems)
     doubts = (
-        *_misspelt(loaded),
         *_unknown_types(loaded, workspaces),
         *_unknown_plugins(loaded),
         *_network_doubts(loaded),
+        *(foreseen_failures(loaded.project, messages) if reads_plugins else ()),
     )
     return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
 
@@ -91,12 +93,12 @@ def seed_variables(project: Project, seed: int) -> dict[str, dict[str, str]]:
     return {name: dict.fromkeys(variables, str(int(seed))) for name, variables in found.items()}
 
 
-def _misspelt(loaded: Loaded) -> Iterator[Problem]:
+def _unknown_containers(project: Project) -> Iterator[Problem]:
     """The containers that are probably meant to be others."""
-    for node in loaded.project.nodes:
-        if meant := misspelt(node.container, loaded.project.folder):
-            text = f"there is no container '{node.container}'"
-            yield Problem(f"node '{node.name}'", 0, 0, "", text, f"did you mean '{meant}'?")
+    for node in project.nodes:
+        text, hint = why_no_container(node.container, project.folder)
+        if text:
+            yield problem_in(node.file, f"{node.pointer}/container", text, hint)
 
 
 def _unknown_types(loaded: Loaded, workspaces: Workspaces) -> Iterator[Problem]:
@@ -160,6 +162,67 @@ def workspaces_of(project: Path) -> Workspaces:
     """The workspaces that a project, a file or a folder, sees."""
     folder = project if project.is_dir() else project.parent
     return Workspaces(folder.resolve() / "workspace", WORKSPACE, os.environ)
+
+
+# ---------------------------------------------------------------------- what would fail
+
+
+def foreseen_failures(project: Project, messages: Messages) -> list[Problem]:
+    """What does not keep a run from starting, but from going well: it will fail, or do nothing.
+
+    ``validate`` refuses it. Before a run these are warnings, since what is in an image is not
+    known here.
+    """
+    return [
+        *_unknown_containers(project),
+        *Loops(project).problems(),
+        *_missing_modules(project, messages),
+    ]
+
+
+def _missing_modules(project: Project, messages: Messages) -> list[Problem]:
+    """What plugins import, and the Python that they run on lacks."""
+    lacking = {
+        node.name: found
+        for node in project.nodes
+        if node.script is None and (found := [*_lacking(node, project, messages)])
+    }
+    if not lacking:
+        return []
+    try:
+        elsewhere = Pythons.choose(project.nodes, project.folder, os.environ).paths
+    except EnvironmentFault:  # a run says what is wrong with a container
+        return []
+    return [each for name, of in lacking.items() if name not in elsewhere for each in of]
+
+
+def _lacking(node: Node, project: Project, messages: Messages) -> Iterator[Problem]:
+    path = node.environment.get("PYTHONPATH", "").split(os.pathsep)
+    folders = [str(node.plugin.parent), *filter(None, path), *map(str, messages.paths)]
+    built = {each.package for each in messages.built}
+    container = find_container(node.container, project.folder)
+    for part in _parts(node.plugin):
+        for needed in part.needs:
+            top = needed.name.partition(".")[0]
+            text = ""
+            if not top and not node.module:
+                text = f"'{needed.name}' is relative, but a plugin is in no package"
+                hint = f"write '{needed.name.lstrip('.') or 'the name of the module'}' without dots"
+            elif top and top not in built and is_missing(needed.name, folders):
+                recipes = [container.folder, OWN_FOLDER / BASE] if container else []
+                is_named = any(_names_package(recipe, top) for recipe in recipes)
+                if is_named and is_missing(top, folders):
+                    continue
+                text = f"there is no module '{needed.name}'"
+                beside = [file.stem for file in node.plugin.parent.glob("*.py")]
+                hint = did_you_mean(top, {*beside, *modules_here()} - {top})
+                hint = hint or (
+                    f"packages such as {top} go into the requirements.txt of the node's container,"
+                    " modules of your own beside the plugin: docs/environments.md"
+                )
+            if text:
+                place = needed.line, needed.column
+                yield Problem(display_name(part.path), *place, "", text, hint)
 
 
 # ---------------------------------------------------------------------- slow checks
@@ -262,11 +325,10 @@ def _rate_problems(node: Node, project: Path) -> Iterator[Problem]:
 
 def _parts(plugin: Path) -> Iterator[PluginFile]:
     """A plugin, and the modules beside it that it imports."""
-    read = read_plugin(plugin)
+    read = read_plugin(plugin) if plugin != Path() else None
     if read is not None:
         yield read
-        modules = (read_plugin(plugin.parent / f"{name}.py") for name in sorted(read.imports))
-        yield from (module for module in modules if module is not None)
+        yield from modules_beside(read)
 
 
 def _model(argument: ast.expr, node: Node, project: Path) -> Path | str | None:

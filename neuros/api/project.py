@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.api.live import LiveRun
-from neuros.api.loading import load_with_messages, model_problems, seed_variables
+from neuros.api.loading import foreseen_failures, load_with_messages, model_problems, seed_variables
 from neuros.api.plan import make_environments, make_plan
 from neuros.api.request import Request
 from neuros.api.run import Run
@@ -147,8 +147,9 @@ class Project:
         Raises:
             ProjectError: with every problem there is.
         """
-        self._loaded = self._load()
-        if problems := model_problems(self._loaded.project):
+        self._loaded, messages = load_with_messages(self._path, override_texts(self.settings))
+        project = self._loaded.project
+        if problems := [*model_problems(project), *foreseen_failures(project, messages)]:
             raise ProjectError(problems)
         return self._loaded.warnings
 

@@ -88,16 +88,21 @@ def find_container(name: str, project: Path, own: Path = OWN_FOLDER) -> Containe
     return ContainerFolder(name, folder, folder.parent == own) if folder else None
 
 
-def misspelt(container: str, project: Path, own: Path = OWN_FOLDER) -> str:
-    """The folder that was probably meant where there is none of this name; empty if none was.
+def why_no_container(container: str, project: Path, own: Path = OWN_FOLDER) -> tuple[str, str]:
+    """What is wrong with a name for which there is no folder, and a hint; empty if nothing is.
 
-    A name without a folder may be that of an image, so only slips of the pen count.
+    A name with a version may be that of an image, so there only slips of the pen count.
     """
     name = bare_name(container)
     if not _NAME.fullmatch(name) or find_container(name, project, own) is not None:
-        return ""
-    known = [each.name for place in (project / FOLDER, own) for each in place.glob("*/")]
-    return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=_SLIP)), "")
+        return "", ""
+    known = [each.name for place in (project / FOLDER, own) for each in sorted(place.glob("*/"))]
+    cutoff = 0.6 if name == container else _SLIP
+    meant = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
+    hint = f"did you mean '{meant[0]}'?" if meant else ""
+    if name == container and not meant:
+        hint = f"there are {', '.join(known)}; an image of your own has a version: '{name}:latest'"
+    return (f"there is no container '{container}'", hint) if hint else ("", "")
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,12 @@ import dataclasses
 import enum
 import json
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.api.request import ProjectOptions
-from neuros.errors import UsageError, printable
+from neuros.errors import Problem, UsageError, printable
 from neuros.options import add_options, options_of
 
 if TYPE_CHECKING:
@@ -81,11 +82,24 @@ def load_with_messages(
     Raises:
         ProjectError: with all its problems, and those of its message files.
     """
+    project, messages, warnings = load_quietly(parsed, reads_plugins=reads_plugins)
+    show_warnings(warnings)
+    return project, messages
+
+
+def show_warnings(warnings: Iterable[Problem]) -> None:
+    """Write them to standard error."""
+    for warning in warnings:
+        print(f"warning: {printable(str(warning))}", file=sys.stderr)
+
+
+def load_quietly(
+    parsed: argparse.Namespace, *, reads_plugins: bool = True
+) -> tuple[Project, Messages, Sequence[Problem]]:
+    """Load the project, its message packages, and warnings. Raises as the one above."""
     from neuros.api.loading import load_with_messages as load
 
     path = project_path(parsed)
     changes = (parsed.set, parsed.namespace, parsed.remap)
     loaded, messages = load(path, *changes, reads_plugins=reads_plugins)
-    for warning in loaded.warnings:
-        print(f"warning: {printable(str(warning))}", file=sys.stderr)
-    return loaded.project, messages
+    return loaded.project, messages, loaded.warnings

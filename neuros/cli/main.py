@@ -15,12 +15,13 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 from neuros.cli import EXIT_CODES
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError, printable
-from neuros.project.suggest import counted, did_you_mean
+from neuros.options import positive_number
+from neuros.project.suggest import counted, did_you_mean, listed
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
@@ -86,6 +87,22 @@ COMMANDS = {
 }
 
 
+_HIDDEN = {name for name, command in COMMANDS.items() if not command.help}
+_WANTED: dict[Any, str] = {
+    int: "a whole number",
+    float: "a number",
+    positive_number: "a whole number from 1 on",
+}
+
+
+_IN_WORDS = {
+    "expected one argument": "needs a value",
+    "expected at least one argument": "needs a value",
+    "ignored explicit argument": "takes no value, but is given",
+    "the following arguments are required:": "name it on the command line, it is missing:",
+}
+
+
 class _Formatter(argparse.HelpFormatter):
     """Fills paragraphs, and leaves lists of exit codes as they are."""
 
@@ -111,6 +128,35 @@ class _Parser(argparse.ArgumentParser):
             unknown_text = f"unrecognized arguments: {' '.join(unknown)}"
             self.error(f"{unknown_text} ({hint})" if hint else unknown_text)
         return options, unknown
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """As argparse does, but with the word that was probably meant, and no hidden commands."""
+        if action.choices is None or value in action.choices:
+            return
+        shown = [str(each) for each in action.choices if str(each) not in _HIDDEN]
+        hint = did_you_mean(str(value), shown)
+        if action.option_strings:
+            text = f"must be {listed(shown)}, but is '{value}'"
+            raise argparse.ArgumentError(action, f"{text} ({hint})" if hint else text)
+        what = str(action.metavar or action.dest).lower()
+        hint = hint or f"there are {', '.join(shown)}"
+        raise argparse.ArgumentError(None, f"there is no {what} '{value}' ({hint})")
+
+    def _get_value(self, action: argparse.Action, text: str) -> Any:
+        """As argparse does, but says what is wanted in words, not by the name of a function."""
+        try:
+            return super()._get_value(action, text)
+        except argparse.ArgumentError as error:
+            wanted = _WANTED.get(action.type) if action.type in _WANTED else None
+            if wanted is None:
+                raise
+            raise argparse.ArgumentError(action, f"'{text}' is not {wanted}") from error
+
+    def error(self, message: str) -> NoReturn:
+        """As argparse does, in words that say what to do."""
+        for said, meant in _IN_WORDS.items():
+            message = message.replace(said, meant)
+        super().error(message)
 
     def _print_message(self, message: str, file: Any = None) -> None:
         """As argparse does, but a help that cannot be written is an error."""
@@ -223,8 +269,7 @@ def _complete(line: str) -> None:
             for action in completed._actions
             if isinstance(action, argparse._SubParsersAction)
         )
-    hidden = [name for name, command in COMMANDS.items() if not command.help]
-    argcomplete.autocomplete(completed, exclude=hidden)
+    argcomplete.autocomplete(completed, exclude=[*_HIDDEN])
 
 
 def _flush() -> None:

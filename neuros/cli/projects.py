@@ -17,9 +17,11 @@ from neuros.cli.common import (
     JSON,
     add_format,
     add_project,
+    load_quietly,
     load_with_messages,
     print_json,
     project_path,
+    show_warnings,
 )
 from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import NeurosError, ProjectError, UsageError, printable
@@ -53,6 +55,8 @@ def add_validate(validate: argparse.ArgumentParser) -> None:
 
 
 def _validate(parsed: argparse.Namespace) -> int:
+    from neuros.project.loops import Loops
+
     is_json = parsed.format == JSON
     try:
         project = _validated(parsed)
@@ -61,22 +65,26 @@ def _validate(parsed: argparse.Namespace) -> int:
             raise
         print_json({"is_valid": False, "problems": error.problems})
         return EXIT_PROJECT
+    loops = Loops(project).found
     if is_json:
-        print_json({"is_valid": True, "problems": []})
+        print_json({"is_valid": True, "problems": [], "loops": loops})
         return 0
     print(
         f"{printable(str(project.file))}: valid: {counted(len(project.nodes), 'node')},"
         f" {counted(len(project.connections), 'connection')}"
     )
+    for loop in loops:
+        print(printable(str(loop)))
     return 0
 
 
 def _validated(parsed: argparse.Namespace) -> Project:
     """The project, without a problem. Raises ``ProjectError``."""
-    from neuros.api.loading import import_problems, model_problems
+    from neuros.api.loading import foreseen_failures, import_problems, model_problems
 
-    project, messages = load_with_messages(parsed)
-    problems = model_problems(project)
+    project, messages, warnings = load_quietly(parsed)
+    problems = [*model_problems(project), *foreseen_failures(project, messages)]
+    show_warnings(each for each in warnings if each not in problems)
     if not problems and parsed.imports:
         problems = import_problems(project, messages, project_path(parsed), parsed.set)
     if problems:

@@ -517,7 +517,8 @@ def unread_variables(
         candidates = {text for text in plugin.texts if _VARIABLE.fullmatch(text)}
         hint = did_you_mean(key, (candidates | {*node.environment}) - {key})
         complaint = f"nothing in the plugin of node '{node.name}' reads {key}"
-        yield Problem(f"--set {text}", 1, 1, "", complaint, hint)
+        place = text.index(f".{key}") + 2
+        yield Problem(f"--set {text}", 1, place, f"{node.pointer}/environment", complaint, hint)
 
 
 @cache

@@ -176,14 +176,15 @@ def apply_override(parsed: ParsedProject, text: str) -> list[Problem]:
     names = len(ends)
     needed = steps if kind == "budgets" else steps[: names + 1]
     if not equals or len(steps) <= names or not all(needed):
-        return [source.problem(0, "", "is not of the form", _FORMS[kind])]
+        return [source.problem(len(target), f"/{kind}", "is not of the form", _FORMS[kind])]
     name, parent = ".".join(steps[:names]), parsed.root
     if kind != "budgets":
         elements = parsed.nodes if kind == "nodes" else parsed.connections
         known = [".".join(each.string(end) or "" for end in ends) for each in elements]
         if name not in known:
             text, hint = f"there is no {kind[:-1]} '{name}'", did_you_mean(name, known)
-            return [source.problem(0, "", text, hint)] if parsed.is_complete else []
+            problem = source.problem(len(kind) + 1, f"/{kind}/{escape(name)}", text, hint)
+            return [problem] if parsed.is_complete else []
         parent = elements[known.index(name)]
     keys = [kind, *steps] if kind == "budgets" else steps[names:]
     # Names of connections and of variables may contain dots.
@@ -236,7 +237,8 @@ def _key(parent: Element, step: str, source: Source) -> str | int:
         if step.isascii() and step.isdigit() and int(step) < len(names):
             return int(step)
         text, hint = f"there is no '{step}' in {parent.pointer}", did_you_mean(step, names)
-    raise SourceError(source.problem(0, "", text, hint))
+    start = source.text.index(f".{step}") + 1  # it is one of the target's steps
+    raise SourceError(source.problem(start, f"{parent.pointer}/{escape(step)}", text, hint))
 
 
 def apply_namespace(parsed: ParsedProject, text: str) -> None:

@@ -11,8 +11,9 @@ import re
 import shutil
 import stat
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.machinery import ModuleSpec
+from importlib.machinery import ModuleSpec, PathFinder
 from itertools import accumulate
 from pathlib import Path
 
@@ -168,6 +169,36 @@ def why_no_module(name: str) -> tuple[str, str]:
     names = [f"{package}.{each.name}" for each in pkgutil.iter_modules(locations)]
     text = f"the installed package '{package}' has no module '{name}'"
     return text, did_you_mean(name, names)
+
+
+def is_missing(name: str, folders: Sequence[str]) -> bool:
+    """Whether there is no module of that name, neither here nor in these folders.
+
+    Nothing is imported. Where a package may make its modules when it is imported, all are there.
+    """
+    top = name.partition(".")[0]
+    if top in sys.stdlib_module_names:
+        return False
+    found = [PathFinder.find_spec(top, folders)]
+    for each in [*accumulate(name.split("."), "{}.{}".format)][1:] if found[0] else ():
+        path = found[-1].submodule_search_locations if found[-1] else None
+        found.append(None if path is None else PathFinder.find_spec(each, path))
+    found = found if found[0] else _specs(name)
+    there = [spec for spec in found if spec]
+    return len(there) < len(found) and not any(map(_makes_modules, there))
+
+
+def modules_here() -> list[str]:
+    """The names of all modules that this Python can import, but for those within packages."""
+    return [each.name for each in pkgutil.iter_modules()]
+
+
+def _makes_modules(spec: ModuleSpec) -> bool:
+    """Whether importing it may bring modules that no file has the name of."""
+    if not spec.origin or not spec.origin.endswith(".py"):
+        return spec.origin is not None  # it is compiled
+    text = Path(spec.origin).read_text("utf-8", "replace")
+    return "sys.modules" in text or "__path__" in text
 
 
 def _specs(name: str) -> list[ModuleSpec | None]:

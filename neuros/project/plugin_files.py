@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from neuros.project.scanner import read_bytes
 from neuros.project.suggest import did_you_mean
@@ -39,6 +39,8 @@ PUBLIC_NAMES = ("All", "Optional", *_ARGUMENTS, *_FOR_TOOLS)
 _WITHOUT_HOOKS = {"matplotlib", "mujoco", "nest", "numpy", "rclpy", "scipy"}
 # With these, a plugin may make hooks in ways that are not to be seen.
 _DYNAMIC = {"__import__", "eval", "exec", "globals", "import_module", "locals", "setattr", "vars"}
+# What sends packets from a thread of the plugin.
+_SENDERS = {"run_asynchronous", "submit"}
 # What later versions of Python know: the node may run on one of those.
 _NEWER = (
     ((3, 11), re.compile(r"\s*except\s*\*")),
@@ -74,13 +76,24 @@ class DeclaredPort:
 class DeclaredHook:
     """A hook that the plugin has in any case; its ports are ``None`` where they are computed.
 
-    ``sim_tick``: line and column of the period, if it ticks by simulated time.
+    ``sim_tick``: line and column of the period, if it ticks by simulated time; ``kind`` is that of
+    its decorator, as ``neuros_tick``.
     """
 
     name: str
     inputs: tuple[DeclaredPort, ...] | None
     outputs: tuple[DeclaredPort, ...] | None
     sim_tick: tuple[int, int] | None = None
+    kind: str = ""
+
+
+@dataclass(frozen=True)
+class NeededModule:
+    """A module that is imported in any case; ``name`` begins with dots where that is relative."""
+
+    name: str
+    line: int
+    column: int
 
 
 @dataclass
@@ -95,6 +108,10 @@ class PluginFile:
         texts: all text constants.
         model_arguments: what is given to ``MuJoCo`` as its model.
         sets_timestep: whether it may change the timestep of a model.
+        needs: the modules without which it cannot be imported.
+        is_whole: whether ``hooks`` are all that it has, but for those that ``functions_of`` bring.
+        functions_of: the modules that it imports functions from.
+        sends_by_itself: whether packets may come from a thread, as from a simulation.
     """
 
     path: Path
@@ -105,6 +122,10 @@ class PluginFile:
     texts: frozenset[str] = frozenset()
     model_arguments: tuple[ast.expr, ...] = ()
     sets_timestep: bool = False
+    needs: tuple[NeededModule, ...] = ()
+    is_whole: bool = False
+    functions_of: frozenset[str] = frozenset()
+    sends_by_itself: bool = False
 
 
 def read_plugin(path: Path) -> PluginFile | None:
@@ -177,6 +198,24 @@ class _Reader:
         constants = (node.value for node in nodes if isinstance(node, ast.Constant))
         plugin.texts = frozenset(value for value in constants if isinstance(value, str))
         plugin.model_arguments = tuple(self._model_arguments())
+        marks = {f"{_HOOKS}.{name}" for name in _ARGUMENTS}
+        expressions = [each for each in nodes if isinstance(each, ast.Name | ast.Attribute)]
+        found = [each for each in expressions if self._meaning(each) in marks]
+        is_computed = any(_names_in(each) & _DYNAMIC for each in nodes)
+        plugin.is_whole = not is_computed and len(found) == len(plugin.hooks)
+        brought = [each for each in nodes if isinstance(each, ast.ImportFrom)]
+        plugin.functions_of = frozenset(
+            "." * each.level + (each.module or "")
+            for each in brought
+            if not _brings_no_functions(each)
+        )
+        is_path_changed = any(
+            isinstance(each, ast.Attribute) and self._meaning(each) == "sys.path" for each in nodes
+        )
+        plugin.needs = () if is_path_changed else tuple(_needed_in(self._tree.body))
+        plugin.sends_by_itself = any(
+            isinstance(each, ast.Attribute) and each.attr in _SENDERS for each in nodes
+        )
         plugin.sets_timestep = any(
             node.attr in ("opt", "option")
             or (node.attr == "timestep" and isinstance(node.ctx, ast.Store))
@@ -259,8 +298,7 @@ class _Reader:
         if any(module != _HOOKS for module in self._stars):
             return True
         for node in self._nodes:
-            names = {getattr(node, "id", None), getattr(node, "attr", None)}
-            if names & (_DYNAMIC | {*_ARGUMENTS}):
+            if _names_in(node) & (_DYNAMIC | {*_ARGUMENTS}):
                 return True
             if isinstance(node, ast.ImportFrom) and not _brings_no_functions(node):
                 return True
@@ -309,7 +347,7 @@ class _Reader:
         return name if name in _ARGUMENTS else ""
 
     def _hook(self, function: _Function, decorator: ast.expr, kind: str) -> DeclaredHook:
-        unknown = DeclaredHook(function.name, None, None)
+        unknown = DeclaredHook(function.name, None, None, kind=kind)
         if not isinstance(decorator, ast.Call):
             self._fail(function, decorator, f"@{kind} needs parentheses")
             return unknown
@@ -338,6 +376,7 @@ class _Reader:
             self._ports(function, given.get("inputs"), "input"),
             self._ports(function, given.get("outputs"), "output"),
             None if period is None else (period.lineno, period.col_offset + 1),
+            kind,
         )
 
     def _check_period(
@@ -461,6 +500,22 @@ class _Reader:
 
 def _remark(node: ast.AST, text: str, hint: str = "") -> Remark:
     return Remark(getattr(node, "lineno", 1), getattr(node, "col_offset", 0) + 1, text, hint)
+
+
+def _needed_in(statements: Sequence[ast.stmt]) -> Iterator[NeededModule]:
+    """What is imported in any case, and not only if it is there."""
+    for each in statements:
+        place = each.lineno, each.col_offset + 1
+        if isinstance(each, ast.Import):
+            yield from (NeededModule(alias.name, *place) for alias in each.names)
+        elif isinstance(each, ast.ImportFrom):
+            yield NeededModule("." * each.level + (each.module or ""), *place)
+        elif isinstance(each, ast.ClassDef):
+            yield from _needed_in(each.body)
+
+
+def _names_in(node: ast.AST) -> set[Any]:
+    return {getattr(node, "id", None), getattr(node, "attr", None)}
 
 
 def _binds(assignment: ast.Assign, name: str) -> bool:

@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ from neuros.api.plan import Plan, check_machine
 from neuros.api.request import Duration, Request, parse_duration
 from neuros.api.run_folder import make_run_folder
 from neuros.cli.launch import signals_noted
-from neuros.cli.main import main
+from neuros.cli.main import COMMANDS, main
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import Node, Project
 from neuros.registry import choose
@@ -185,16 +186,20 @@ def test_an_unknown_option_is_refused_with_the_usage_of_its_command(
     assert f"neuros graph: error: unrecognized arguments: {option}{hint}" in error
 
 
-def test_a_misspelt_container_is_a_warning_and_an_image_of_ones_own_is_none(
+def test_a_container_that_is_not_there_is_named_and_an_image_of_ones_own_has_a_version(
     project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     text = project.read_text().replace("neuros_python", "neuros_pyton", 1)
-    project.write_text(text.replace("neuros_python", "my_brain"))
+    project.write_text(text.replace("neuros_python", "pytorch"))
+    assert main(["validate", "project.json"]) == 3
+    first, second, last = capsys.readouterr().err.splitlines()
+    assert "/nodes/0/container: there is no container 'neuros_pyton' (did you mean" in first
+    assert "/nodes/1/container: there is no container 'pytorch' (there are neuros_mujoco" in second
+    assert "'pytorch:latest'" in second
+    assert last == "2 problems; nothing was started"
+    project.write_text(text.replace("neuros_python", "pytorch:2").replace("neuros_pyton", "o/x"))
     assert main(["validate", "project.json"]) == 0
-    warning = (
-        "warning: node 'a': there is no container 'neuros_pyton' (did you mean 'neuros_python'?)"
-    )
-    assert capsys.readouterr().err.splitlines() == [warning]
+    assert capsys.readouterr().err == ""
 
 
 def test_without_a_command_the_commands_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
@@ -497,3 +502,47 @@ def test_a_size_of_the_packet_log_has_a_unit(
 def test_digests_need_a_packet_log(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["launch", ".", "--digests", "--packet-log", "0"]) == 2
     assert "--packet-log 0 keeps no digests" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("lauch p", "there is no command 'lauch' (did you mean 'launch'?)"),
+        ("bag inf p", "there is no action 'inf' (did you mean 'info'?)"),
+        ("launch p --storage mcp", "'sqlite3', but is 'mcp' (did you mean 'mcap'"),
+        ("launch p --peer-timeout x", "'x' is not a whole number from 1 on"),
+        ("replay p --rate fast", "'fast' is not a number"),
+        ("launch p -o", "argument -o/--output: needs a value"),
+        ("launch p --progress=3", "takes no value, but is given '3'"),
+        ("verify a", "it is missing: RUN_B"),
+    ],
+)
+def test_a_mistyped_command_line_is_answered_in_words(
+    line: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(line.split())
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_no_command_that_only_neuros_starts_is_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["qqqq"])
+    said = capsys.readouterr().err
+    assert "launch" in said
+    hidden = [name for name, command in COMMANDS.items() if not command.help]
+    assert hidden
+    assert not {*hidden} & {*re.findall(r"[\w-]+", said)}
+
+
+def test_a_plugin_that_is_run_as_a_program_says_what_to_run(tmp_path: Path) -> None:
+    plugin = tmp_path / "brain.py"
+    plugin.write_text("from neuros.hooks import *\n@neuros_tick(1)\ndef f(node): ...\n")
+    run = partial(subprocess.run, capture_output=True, text=True, check=True)
+    said = run([sys.executable, str(plugin)]).stderr
+    assert f"{plugin} is a plugin" in said
+    assert f"neuros launch {tmp_path}\n" in said
+    program = "import neuros.testing\nneuros.testing.PluginHarness\n"
+    plugin.write_text(program + plugin.read_text())
+    assert run([sys.executable, str(plugin)]).stderr == ""

@@ -114,7 +114,9 @@ def test_python_programs_get_the_same_as_warnings_and_errors() -> None:
         outputs=[IMU],
         container="neuros_mujocco",
     )
-    meant = r"node 'robot': there is no container 'neuros_mujocco' .did you mean 'neuros_mujoco'"
+    meant = (
+        r"/nodes/0/container: there is no container 'neuros_mujocco' .did you mean 'neuros_mujoco'"
+    )
     with pytest.warns(UserWarning, match=meant):
         project = neuros.Project.from_file(".")
     setting = "nodes.robot.environment.SPEDE"
@@ -136,8 +138,8 @@ def test_a_sweep_over_what_nothing_reads_says_so_once(capsys: pytest.CaptureFixt
     arguments = ["--set", "nodes.robot.environment.SPEDE=1", "--backend", "in-process"]
     assert main(["sweep", ".", *arguments]) == 0
     assert capsys.readouterr().err == (
-        "warning: --set nodes.robot.environment.SPEDE=1:1:1: nothing in the plugin of node 'robot'"
-        " reads SPEDE (did you mean 'SPEED'?)\n"
+        "warning: --set nodes.robot.environment.SPEDE=1: character 25: /nodes/0/environment:"
+        " nothing in the plugin of node 'robot' reads SPEDE (did you mean 'SPEED'?)\n"
     )
 
 
@@ -171,3 +173,89 @@ def test_a_message_package_that_is_not_there_is_described_with_its_manifest(
     assert main(["validate", "."]) == 3
     hint = "workspace/arm_msgs/msg/Joints.msg beside the project file, with"
     assert f"{hint} workspace/arm_msgs/package.xml" in capsys.readouterr().err
+
+
+IMPORTED = "@neuros_tick(1)\ndef f(node): ...\n"
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("import numpyy", "robot.py:4:1: there is no module 'numpyy' (did you mean 'numpy'?)"),
+        ("from qqqq.zzzz import x", "robot.py:4:1: there is no module 'qqqq.zzzz' (packages such"),
+        ("import numpy.fftt", "robot.py:4:1: there is no module 'numpy.fftt'"),
+        ("import numpy, besides", "module 'besides' (did you mean 'beside'?)"),
+        ("class A:\n    import qqqq", "robot.py:5:5: there is no module 'qqqq'"),
+        ("from .beside import x", "'.beside' is relative, but a plugin is in no package"),
+        ("import beside_lacks", "beside_lacks.py:1:1: there is no module 'qqqq'"),
+    ],
+)
+def test_a_missing_module_is_named_with_its_place(
+    line: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("beside.py").write_text("raise SystemExit('it was run')\n")
+    Path("beside_lacks.py").write_text("import qqqq\n")
+    write(f"{HEAD}{line}\n{IMPORTED}")
+    assert main(["validate", "."]) == 3
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        "import os.path, xml.dom.minidom, encodings.utf_8, std_msgs.msg, neuros.snn",
+        "try:\n    import qqqq\nexcept ImportError:\n    import zzzz",
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import qqqq",
+        "def g():\n    import qqqq",
+        "import contextlib\nwith contextlib.suppress(ImportError):\n    import qqqq",
+        "import beside, folder.inner",
+        "import sys\nsys.path.append('elsewhere')\nimport qqqq",
+        "import makes.anything",
+        "import on_path",
+    ],
+)
+def test_what_is_there_or_may_be_missing_is_no_problem(lines: str) -> None:
+    Path("beside.py").write_text("raise SystemExit('it was run')\n")
+    for file in ("folder/inner.py", "elsewhere/qqqq.py", "path/on_path.py"):
+        Path(file).parent.mkdir()
+        Path(file).write_text("raise SystemExit('it was run')\n")
+    Path("makes").mkdir()
+    Path("makes/__init__.py").write_text("import sys\nsys.modules['makes.anything'] = sys\n")
+    write(f"{HEAD}{lines}\n{IMPORTED}", environment={"PYTHONPATH": "#path"})
+    assert main(["validate", "."]) == 0
+
+
+def test_what_the_recipe_of_a_container_names_may_be_missing_here() -> None:
+    Path("containers/arm").mkdir(parents=True)
+    Path("containers/arm/Dockerfile").write_text("RUN pip install qqqq-lib\n")
+    write(f"{HEAD}import qqqq_lib\n{IMPORTED}", container="arm")
+    assert main(["validate", "."]) == 0
+
+
+def test_before_a_run_a_missing_module_is_a_warning(capsys: pytest.CaptureFixture[str]) -> None:
+    write(f"{HEAD}import qqqq\n{IMPORTED}")
+    assert main(["launch", ".", "--dry-run", "--backend", "process"]) == 0
+    assert "warning: robot.py:4:1: there is no module 'qqqq'" in capsys.readouterr().err
+
+
+def test_a_loop_that_nobody_starts_is_refused_and_another_one_is_told(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    port = [{"name": "ball", "type": "std_msgs/msg/Int32"}]
+    hit = f"{HEAD}@neuros_function('ball', 'ball')\ndef hit(node, ball): return ball\n"
+    write(hit, inputs=port, outputs=port)
+    project = json.loads(Path("project.json").read_text())
+    ends = ("source_node", "source_output", "destination_node", "destination_input")
+    project["connections"] = [dict(zip(ends, ("robot", "ball") * 2, strict=True))]
+    Path("project.json").write_text(json.dumps(project))
+    assert main(["validate", "."]) == 3
+    assert "robot.py:4:18: nobody starts the loop of robot" in capsys.readouterr().err
+    serve = "@neuros_initialise(outputs='ball')\ndef serve(node): return node.make_packet('ball')\n"
+    Path("robot.py").write_text(hit + serve)
+    assert main(["validate", "."]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[1] == "loop of robot: started by initialise hook 'serve' of robot"
+    assert main(["validate", ".", "--format", "json"]) == 0
+    (loop,) = json.loads(capsys.readouterr().out)["loops"]
+    starters = ["initialise hook 'serve' of robot"]
+    assert loop == {"nodes": ["robot"], "started_by": starters}

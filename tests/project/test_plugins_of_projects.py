@@ -365,7 +365,8 @@ STEP = os.environ["NEUROS_RANDOMISE_DIRECTION"], os.environ.get("SEED")
 def test_a_variable_that_nothing_reads_is_a_warning(check: Check, name: str, hint: str) -> None:
     setting = f"nodes.brain.environment.{name}=1"
     assert doubts(check, READS + FINE, [setting]) == [
-        f"--set {setting}:1:1: nothing in the plugin of node 'brain' reads {name}{hint}"
+        f"--set {setting}: character 25: /nodes/0/environment: nothing in the plugin of node"
+        f" 'brain' reads {name}{hint}"
     ]
 
 

@@ -95,12 +95,12 @@ def test_the_command_line_goes_before_the_project(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("x", "--remap x:1:1: /remap: is not a rule"),
+        ("x", "--remap x: character 1: /remap: is not a rule"),
         ("x=y", "is not a rule"),
         (":=y", "is not a rule"),
         ("__ns:=/x", "'__ns' is not remapped (use --namespace)"),
         ("camera:__node:=x", "'camera:__node' is not remapped"),
-        ("x:=2y", "--remap x:=2y:1:4: /remap/x: '2y' is not allowed as new name"),
+        ("x:=2y", "--remap x:=2y: character 4: /remap/x: '2y' is not allowed as new name"),
         ("x y:=z", "'x y' is not allowed as a name here"),
         ("camrea:x:=y", "there is no node 'camrea' (did you mean 'camera'?)"),
     ],

@@ -111,37 +111,40 @@ def test_they_apply_in_their_order(file: Path) -> None:
 @pytest.mark.parametrize(
     ("override", "problem"),
     [
-        ("nodes.robt.plugin=p.py", "1:1: /: there is no node 'robt' (did you mean 'robot'?)"),
+        ("nodes.robt.plugin=p.py",
+         "7: /nodes/robt: there is no node 'robt' (did you mean 'robot'?)"),
         ("connections.robot.imu.snn.im.queue_size=1",
-         "1:1: /: there is no connection 'robot.imu.snn.im' (did you mean 'robot.imu.snn.imu'?)"),
+         "13: /connections/robot.imu.snn.im: there is no connection 'robot.imu.snn.im'"
+         " (did you mean 'robot.imu.snn.imu'?)"),
         ("node.robot.plugin=p.py",
-         "1:1: /: must begin with 'nodes.', 'connections.' or 'budgets.' (did you mean 'nodes'?)"),
-        ("nodes.robot=1", "1:1: /: is not of the form (nodes.NAME.KEY=VALUE)"),
-        ("nodes.robot.plugin", "1:1: /: is not of the form (nodes.NAME.KEY=VALUE)"),
+         "1: /: must begin with 'nodes.', 'connections.' or 'budgets.' (did you mean 'nodes'?)"),
+        ("nodes.robot=1", "12: /nodes: is not of the form (nodes.NAME.KEY=VALUE)"),
+        ("nodes.robot.plugin", "19: /nodes: is not of the form (nodes.NAME.KEY=VALUE)"),
         ("connections.robot.imu.snn.imu=1",
-         "1:1: /: is not of the form (connections.SRC.OUT.DST.IN.KEY=VALUE)"),
-        ("nodes.robot.name.first=1", "1:1: /: 'first' cannot be set: there is no object around it"),
-        ("nodes.robot.outputs.odom.type=x", "1:1: /: there is no 'odom' in /outputs"),
+         "30: /connections: is not of the form (connections.SRC.OUT.DST.IN.KEY=VALUE)"),
+        ("nodes.robot.name.first=1",
+         "18: /name/first: 'first' cannot be set: there is no object around it"),
+        ("nodes.robot.outputs.odom.type=x", "21: /outputs/odom: there is no 'odom' in /outputs"),
         ("budgets=1",
-         "1:1: /: is not of the form"
+         "8: /budgets: is not of the form"
          " (budgets.KEY=VALUE or budgets.lost_packets.SRC.OUT -> DST.IN=VALUE)"),
         ("budgets.real_time_factr=1",
-         "1:25: /budgets/real_time_factr: unknown key 'real_time_factr'"
+         "25: /budgets/real_time_factr: unknown key 'real_time_factr'"
          " (did you mean 'real_time_factor'?)"),
         ("budgets.lost_packets.robot.im -> snn.imu=1",
-         "1:42: /budgets/lost_packets/robot.im -> snn.imu: there is no connection"
+         "42: /budgets/lost_packets/robot.im -> snn.imu: there is no connection"
          " 'robot.im -> snn.imu' (did you mean 'robot.imu -> snn.imu'?)"),
         ("connections.robot.imu.snn.imu.discard_limit=-1",
-         "1:45: /connections/0/discard_limit: must be at least 0, but is -1"),
-        ("nodes.snn.colour=red", "1:18: /nodes/1/colour: unknown key 'colour'"),
+         "45: /connections/0/discard_limit: must be at least 0, but is -1"),
+        ("nodes.snn.colour=red", "18: /nodes/1/colour: unknown key 'colour'"),
         ("nodes.robot.plugin=q.py",
-         "1:20: /plugin: there is no file 'q.py' (did you mean 'p.py'?)"),
+         "20: /plugin: there is no file 'q.py' (did you mean 'p.py'?)"),
         ('nodes.robot.environment={"A": 1, "A": 2}',
-         "1:34: /environment/A: the key 'A' occurs twice (first in line 1)"),
+         "34: /environment/A: the key 'A' occurs twice (first in line 1)"),
     ],
 )  # fmt: skip
 def test_mistakes_are_located_in_the_override(file: Path, override: str, problem: str) -> None:
-    assert problems(file, override) == [f"--set {override}:{problem}"]
+    assert problems(file, override) == [f"--set {override}: character {problem}"]
 
 
 def test_mistakes_come_together_with_those_of_the_files(file: Path) -> None:
