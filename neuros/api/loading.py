@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -32,6 +33,10 @@ from neuros.recording.provenance import seeds
 
 _LONG_BYTES = 1 << 20
 """A file of a container's folder from this size on is data, not a recipe."""
+_MJCF = (".xml", ".mjcf")
+_MODELS = (*_MJCF, ".urdf", ".sdf", ".world")
+_PLACE = re.compile(r"(\S.*?):(\d+):(\d+): (.*)")
+_LINE = re.compile(r"\bline (\d+)")
 
 
 def load_with_messages(
@@ -227,21 +232,21 @@ def _lacking(node: Node, project: Project, messages: Messages) -> Iterator[Probl
 
 # ---------------------------------------------------------------------- slow checks
 #
-# Slow checks of a project: timesteps of its MuJoCo models, and imports of its plugins.
+# Slow checks of a project: its MuJoCo models, and imports of its plugins.
 #
 # A run finds these out by itself, a moment later.
 
 
 def model_problems(project: Project) -> list[Problem]:
-    """Sensors whose rates do not fit the timestep of their MuJoCo model, where that is known.
+    """What is wrong with MuJoCo models, and with sensors and actuators that are declared for them.
 
-    It is known where the plugin names one model in MJCF, by a literal or an environment variable of
-    its node, and MuJoCo is installed here.
+    A model is known where the plugin names it by a literal or an environment variable of its node,
+    and MuJoCo is installed here.
     """
-    nodes = [node for node in project.nodes if _rates(node)]
+    nodes = [node for node in project.nodes if _has_model(node)]
     if not nodes or find_spec("mujoco") is None:
         return []
-    return [problem for node in nodes for problem in _rate_problems(node, project.folder)]
+    return [problem for node in nodes for problem in _model_problems(node, project.folder)]
 
 
 def import_problems(
@@ -292,35 +297,43 @@ def _import(python: Path, name: str, path: Path, overrides: Sequence[str]) -> st
 # ---------------------------------------------------------------------- models
 
 
-def _rates(node: Node) -> dict[int, float]:
-    """The rates of sensors, in Hz, by the place of their output."""
-    rates = {index: port.mujoco.get("rate") for index, port in enumerate(node.outputs)}
-    return {index: float(rate) for index, rate in rates.items() if rate}
+def _has_model(node: Node) -> bool:
+    parts = _parts(node.plugin)
+    return any(port.mujoco for port in (*node.inputs, *node.outputs)) or any(
+        part.model_arguments for part in parts
+    )
 
 
-def _rate_problems(node: Node, project: Path) -> Iterator[Problem]:
+def _model_problems(node: Node, project: Path) -> Iterator[Problem]:
     parts = [*_parts(node.plugin)]
-    models = [argument for part in parts for argument in part.model_arguments]
-    if len(models) != 1 or any(part.sets_timestep for part in parts):
+    models = [(part, argument) for part in parts for argument in part.model_arguments]
+    if len(models) != 1:
         return
-    model = _model(models[0], node, project)
-    if model is None:
+    (part, argument), sets_timestep = models[0], any(part.sets_timestep for part in parts)
+    model = _model(argument, node, project)
+    if isinstance(model, tuple):
+        place = display_name(part.path), argument.lineno, argument.col_offset + 1
+        yield Problem(*place, "", *model)
+    if model is None or isinstance(model, tuple):
         return
-    from neuros.simulators.mujoco.timing import Timebase
-    from neuros.simulators.mujoco.world import timestep_of
+    from neuros.simulators.mujoco.world import problems_of
 
-    try:
-        time = Timebase(timestep_of(model))
-    except ValueError as error:
-        where = display_name(model if isinstance(model, Path) else node.plugin)
-        yield Problem(where, 0, 0, "", " ".join(str(error).split()))
-        return
-    for index, rate in _rates(node).items():
-        try:
-            time.period_steps(rate)
-        except ValueError as error:
-            pointer = f"{node.pointer}/outputs/{index}/mujoco/rate"
-            yield problem_in(node.file, pointer, str(error))
+    for pointer, text in problems_of(node, model):
+        if pointer and not (sets_timestep and pointer.endswith("/rate")):
+            yield problem_in(node.file, pointer, text)
+        elif not pointer:
+            yield from _located_in(model if isinstance(model, Path) else node.plugin, text)
+
+
+def _located_in(file: Path, text: str) -> Iterator[Problem]:
+    """What a compiler of models says, in one line or several, with the place where it names one."""
+    for row in text.splitlines():
+        if found := _PLACE.fullmatch(row):
+            yield Problem(found[1], int(found[2]), int(found[3]), "", found[4])
+            continue
+        line = _LINE.search(row)
+        said = row.removeprefix(f"{file}: ")
+        yield Problem(display_name(file), *((int(line[1]), 1) if line else (0, 0)), "", said)
 
 
 def _parts(plugin: Path) -> Iterator[PluginFile]:
@@ -331,15 +344,22 @@ def _parts(plugin: Path) -> Iterator[PluginFile]:
         yield from modules_beside(read)
 
 
-def _model(argument: ast.expr, node: Node, project: Path) -> Path | str | None:
-    """A file in MJCF, or its text; ``None`` where that is not known."""
+def _model(argument: ast.expr, node: Node, project: Path) -> Path | str | tuple[str, str] | None:
+    """A file with a model, or MJCF as text; a problem and its hint where that is not there.
+
+    ``None`` where it is not known.
+    """
     text = _text(argument, node)
     if text is None or text.lstrip().startswith("<"):
         return text
-    places = (node.plugin.parent, node.file.parent, project)
+    places = dict.fromkeys((node.plugin.parent, node.file.parent, project))
     files = [place / text.removeprefix("#").lstrip("/") for place in places]
     files = [Path(text)] if Path(text).is_absolute() else files
-    return next((f for f in files if f.suffix == ".xml" and f.is_file()), None)
+    found = next((f for f in files if f.suffix in _MODELS and f.is_file()), None)
+    if found is None and Path(text).suffix in _MJCF and not text.startswith("@"):
+        beside = [f.name for file in files for f in file.parent.glob("*") if f.suffix in _MODELS]
+        return f"there is no model '{text}'", did_you_mean(Path(text).name, beside)
+    return found
 
 
 def _text(expression: ast.expr, node: Node) -> str | None:

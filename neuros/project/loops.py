@@ -210,13 +210,14 @@ def _rings(keys: Iterable[_Key], after: Callable[[_Key], Iterable[_Key]]) -> lis
         seen.add(root)
         while path:
             key, rest = path[-1]
-            unseen = [other for other in rest if other not in seen][:1]
-            if not unseen:
+            for other in rest:
+                if other not in seen:
+                    seen.add(other)
+                    path.append((other, iter(forward[other])))
+                    break
+            else:
                 done.append(key)
                 path.pop()
-            for other in unseen:
-                seen.add(other)
-                path.append((other, iter(forward[other])))
     component: dict[_Key, _Key] = {}
     for root in reversed(done):
         waiting = [root]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import warnings
 from pathlib import Path
 from typing import Any
@@ -81,7 +82,60 @@ def test_a_model_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> No
     Path("box.xml").write_text("<mujoco><bodi/></mujoco>")
     write(f"{HEAD}{HOOK}MuJoCo(node, 'box.xml')", outputs=[IMU])
     assert main(["validate", "."]) == 3
-    assert capsys.readouterr().err.startswith("box.xml: ")
+    assert capsys.readouterr().err.startswith("box.xml:1:1: the model does not compile: ")
+
+
+def declared(name: str, type_name: str, **mujoco: Any) -> dict[str, Any]:
+    return {"name": name, "type": type_name, "mujoco": mujoco}
+
+
+def test_every_name_that_the_model_lacks_is_named_at_once_with_its_place(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    model = """<mujoco><worldbody><body name="box"><joint name="hinge"/><geom size="1"/>
+    <camera name="eye"/><site name="tip"/></body></worldbody>
+    <actuator><motor name="push" joint="hinge"/></actuator></mujoco>"""
+    Path("box.xml").write_text(model)
+    number = "std_msgs/msg/Float64"
+    write(
+        f"{HEAD}{HOOK}MuJoCo(node, 'box.xml')",
+        outputs=[
+            declared("a", "sensor_msgs/msg/Image", sensor="camera", element="eyes", rate=10),
+            declared("b", "sensor_msgs/msg/Imu", sensor="imu", element="top", rate=10),
+            declared("c", "sensor_msgs/msg/Imu", sensor="imu", element="tip", rate=10),
+        ],
+        inputs=[
+            declared("d", number, actuator="pusch"),
+            declared("e", number, joint="hing", drive="motor"),
+            declared("f", number, actuator="push"),
+        ],
+    )
+    assert main(["validate", "."]) == 3
+    said = capsys.readouterr().err.splitlines()
+    assert all(re.match(r"project\.json:\d+:\d+: /nodes/0/", row) for row in said[:-1])
+    assert sorted(row.partition(": /nodes/0/")[2] for row in said[:-1]) == [
+        "inputs/0/mujoco/actuator: the model has no actuator 'pusch' (did you mean 'push'?)",
+        "inputs/1/mujoco/joint: the model has no joint 'hing' (did you mean 'hinge'?)",
+        "outputs/0/mujoco/element: the model has no camera 'eyes' (did you mean 'eye'?)",
+        "outputs/1/mujoco/element: the model has no site or body 'top' (did you mean 'tip'?)",
+    ]
+
+
+def test_what_an_entity_may_still_bring_is_not_missed() -> None:
+    Path("box.xml").write_text(MODEL)
+    imu = declared("a", "sensor_msgs/msg/Imu", sensor="imu", element="drone/imu", rate=10)
+    write(f"{HEAD}{HOOK}MuJoCo(node, 'box.xml')", outputs=[imu])
+    assert main(["validate", "."]) == 0
+
+
+def test_a_model_that_is_not_there_is_named_where_the_plugin_names_it(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    Path("box.xml").write_text(MODEL)
+    write(f"{HEAD}{HOOK}MuJoCo(node, 'bocks.xml')")
+    assert main(["validate", "."]) == 3
+    said = capsys.readouterr().err
+    assert said.startswith("robot.py:6:18: there is no model 'bocks.xml' (did you mean 'box.xml'?)")
 
 
 def test_importing_finds_what_reading_cannot(capfd: pytest.CaptureFixture[str]) -> None:

@@ -63,6 +63,16 @@ def test_a_loop_tells_who_starts_it(tmp_path: Path, plugin: str, starter: str) -
     assert not [*loops.problems()]
 
 
+def test_ways_that_join_again_are_no_loop(tmp_path: Path) -> None:
+    ring(tmp_path, PASS_ON, PASS_ON, PASS_ON)
+    project = json.loads((tmp_path / "project.json").read_text())
+    project["connections"][2] |= {"source_node": "n0", "destination_node": "n2"}
+    (tmp_path / "project.json").write_text(json.dumps(project))
+    loops = Loops(load_project(tmp_path, workspace=tmp_path).project)
+    assert loops.found == ()
+    assert not [*loops.problems()]
+
+
 @pytest.mark.parametrize("length", [1, 2, 3])
 @pytest.mark.parametrize("waiting", [PASS_ON, LATE], ids=["function", "initialise"])
 def test_a_loop_that_nobody_starts_is_a_problem_with_its_place_and_cure(

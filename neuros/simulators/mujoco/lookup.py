@@ -25,22 +25,26 @@ class Problems:
     """Gathers what is wrong in one file, and raises all of it in one ``ModelError``.
 
     ``hint`` stands at the end of each.
+
+    Attributes:
+        found: of each the pointer, empty where it is of another file, and the text.
     """
 
     def __init__(self, file: object, hint: str = "") -> None:
         self._file, self._hint = file, hint
-        self._texts: list[str] = []
+        self.found: list[tuple[str, str]] = []
 
     def add(self, pointer: str, text: str) -> None:
-        self._texts.append(f"{self._file}: {pointer}: {text}{self._hint}")
+        self.found.append((pointer, f"{text}{self._hint}"))
 
     def add_text(self, text: str) -> None:
         """A problem of another file, with its address already in the text."""
-        self._texts.append(text)
+        self.found.append(("", text))
 
     def raise_any(self) -> None:
-        if self._texts:
-            raise ModelError("\n".join(self._texts))
+        if self.found:
+            texts = (f"{self._file}: {at}: {text}" if at else text for at, text in self.found)
+            raise ModelError("\n".join(texts))
 
 
 class Faults:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ import numpy as np
 
 from neuros.errors import DescriptionError, ModelError
 from neuros.ports import NodeContext, Packet
+from neuros.project.model import Node
 from neuros.simulators.convert.elements import Finder, NotFound, finder
 from neuros.simulators.convert.sdf import convert_sdf
 from neuros.simulators.convert.urdf import read_urdf
@@ -41,7 +43,65 @@ class _Bound:
     is_complete: bool
 
 
-class World:
+class Declared:
+    """A compiled model with the sensors and commands of a node, as they are declared.
+
+    Raises ``ModelError`` with every problem of the declarations and the model at once.
+    """
+
+    def __init__(
+        self,
+        description: Node,
+        load: Callable[[], tuple[Any, str]],
+        problems: Problems,
+        *,
+        fine: bool,
+    ) -> None:
+        self._sensors = read_sensors(description, problems)
+        self._commands = read_commands(description, problems)
+        try:
+            self._spec, self.where = load()
+            _prepare_rendering(self._spec, self._sensors, fine=fine)
+            joints = _joints_of(self._spec)
+            add_drives(self._spec, joints, self._commands, problems)
+            self.model = _compile_spec(self._spec, self.where)
+        except ModelError as error:
+            problems.add_text(str(error))
+            problems.raise_any()
+        self.cameras = Cameras(self.model, fine=fine)
+        self.time = Timebase(self.model.opt.timestep)
+        self.schedule = self._make_schedule(problems)
+        self._bound = self._bind(self.model, problems)
+        problems.raise_any()
+
+    def _make_schedule(self, problems: Problems) -> Schedule:
+        periods = {}
+        for sensor in self._sensors:
+            try:
+                periods[sensor.output] = self.time.period_steps(sensor.rate_hz)
+            except ValueError as error:
+                problems.add(f"{sensor.pointer}/rate", str(error))
+        return Schedule(periods)
+
+    def _bind(self, model: Any, problems: Problems, *, may_wait: bool = True) -> _Bound:
+        bodies = names_of(model, "body")
+
+        def can_be_bound(elements: Iterable[str]) -> bool:
+            return not may_wait or all(
+                has_any(model, name) or not _may_come(name, bodies) for name in elements
+            )
+
+        sensors = [sensor for sensor in self._sensors if can_be_bound(sensor.elements)]
+        commands = [command for command in self._commands if can_be_bound(command.actuators)]
+        is_complete = len(sensors) == len(self._sensors) and len(commands) == len(self._commands)
+        return _Bound(
+            bind_sensors(model, sensors, self.cameras, problems),
+            bind_commands(model, commands, problems),
+            is_complete,
+        )
+
+
+class World(Declared):
     """Physics in whole steps, without any notion of who steps it and when.
 
     A sensor is read by ``mj_forward`` at the state of its firing time, so that what it measures
@@ -50,30 +110,13 @@ class World:
 
     A declaration that names an element called ``name/...``, which :meth:`spawn` may still bring, is
     bound when it is there; :meth:`require_bound` says that nothing more comes.
-
-    Raises ``ModelError`` with every problem of the declarations and the model at once.
     """
 
     def __init__(self, node: NodeContext, model: Any, *, fine: bool) -> None:
         self._node = node
         problems = Problems(node.description.file)
-        self._sensors = read_sensors(node.description, problems)
-        self._commands = read_commands(node.description, problems)
-        try:
-            self._spec, self.where = _load_spec(node, model)
-            _prepare_rendering(self._spec, self._sensors, fine=fine)
-            joints = _joints_of(self._spec)
-            add_drives(self._spec, joints, self._commands, problems)
-            self.model = _compile_spec(self._spec, self.where)
-        except ModelError as error:
-            problems.add_text(str(error))
-            problems.raise_any()
+        super().__init__(node.description, lambda: _load_spec(node, model), problems, fine=fine)
         self.data = mujoco.MjData(self.model)
-        self.cameras = Cameras(self.model, fine=fine)
-        self.time = Timebase(self.model.opt.timestep)
-        self.schedule = self._make_schedule(problems)
-        self._bound = self._bind(self.model, problems)
-        problems.raise_any()
         if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
             import_opengl()  # what is missing is said now, and not at the first image
         self.steps = 0
@@ -191,15 +234,6 @@ class World:
             for field in fields:
                 getattr(self.data, field)[: len(rows)] = getattr(before, field)[list(rows)]
 
-    def _make_schedule(self, problems: Problems) -> Schedule:
-        periods = {}
-        for sensor in self._sensors:
-            try:
-                periods[sensor.output] = self.time.period_steps(sensor.rate_hz)
-            except ValueError as error:
-                problems.add(f"{sensor.pointer}/rate", str(error))
-        return Schedule(periods)
-
     def _attach(
         self, spec: Any, child: Any, position: Sequence[float], name: str, problems: Problems
     ) -> None:
@@ -210,23 +244,6 @@ class World:
         )
         spec.attach(child, prefix=f"{name}/", frame=frame)
         add_drives(spec, _joints_of(spec) - before, self._commands, problems)
-
-    def _bind(self, model: Any, problems: Problems, *, may_wait: bool = True) -> _Bound:
-        bodies = names_of(model, "body")
-
-        def can_be_bound(elements: Iterable[str]) -> bool:
-            return not may_wait or all(
-                has_any(model, name) or not _may_come(name, bodies) for name in elements
-            )
-
-        sensors = [sensor for sensor in self._sensors if can_be_bound(sensor.elements)]
-        commands = [command for command in self._commands if can_be_bound(command.actuators)]
-        is_complete = len(sensors) == len(self._sensors) and len(commands) == len(self._commands)
-        return _Bound(
-            bind_sensors(model, sensors, self.cameras, problems),
-            bind_commands(model, commands, problems),
-            is_complete,
-        )
 
     def _look_at_warnings(self, count: int) -> None:
         for warning, number in enumerate(self.data.warning.number.tolist()):
@@ -283,25 +300,31 @@ def _load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
     if isinstance(model, mujoco.MjSpec):
         return model.copy(), f"MjSpec '{model.modelname}'"
     if isinstance(model, str) and model.lstrip().startswith("<"):
-        where = f"XML text in {node.description.plugin}"
-        return _parsed(lambda: mujoco.MjSpec.from_string(model), where), where
+        return _from_text(node.description, model)
     if isinstance(model, str | Path):
         path = _resolve(node, str(model))
-        return _from_file(node, path), str(path)
+        return _from_file(node.description, path, node.get_logger().warning), str(path)
     raise ModelError(
         f"a model is the path of a file, MJCF as text, or a mujoco.MjSpec, "
         f"not a {type(model).__name__}"
     )
 
 
-def timestep_of(model: Path | str) -> float:
-    """The timestep of a model in MJCF, a file or its text, in seconds.
+def problems_of(description: Node, model: Path | str) -> list[tuple[str, str]]:
+    """What is wrong with a model, a file or MJCF as text, and with a node's declarations for it.
 
-    Raises:
-        ValueError: if it is none.
+    Of each, the place in the node file, empty where it is of the model, and the text.
     """
-    spec = mujoco.MjSpec.from_file if isinstance(model, Path) else mujoco.MjSpec.from_string
-    return float(spec(str(model)).option.timestep)
+
+    def load() -> tuple[Any, str]:
+        if isinstance(model, str):
+            return _from_text(description, model)
+        return _from_file(description, model, lambda _: None), str(model)
+
+    problems = Problems(description.file)
+    with contextlib.suppress(ModelError):
+        Declared(description, load, problems, fine=False)
+    return problems.found
 
 
 def _resolve(node: NodeContext, model: str) -> Path:
@@ -312,17 +335,22 @@ def _resolve(node: NodeContext, model: str) -> Path:
         if Path(model).suffix.lower() not in _DESCRIPTIONS:
             raise
         try:
-            return _finder(node).find(model, node.description.plugin.parent)
+            return _finder(node.description).find(model, node.description.plugin.parent)
         except NotFound:
             pass
         raise
 
 
-def _finder(node: NodeContext) -> Finder:
-    return finder((), {**os.environ, **node.description.environment})
+def _finder(description: Node) -> Finder:
+    return finder((), {**os.environ, **description.environment})
 
 
-def _from_file(node: NodeContext, path: Path) -> Any:
+def _from_text(description: Node, model: str) -> tuple[Any, str]:
+    where = f"XML text in {description.plugin}"
+    return _parsed(lambda: mujoco.MjSpec.from_string(model), where), where
+
+
+def _from_file(description: Node, path: Path, warn: Callable[[str], object]) -> Any:
     kind = path.suffix.lower()
     if kind == ".xml":
         return _parsed(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
@@ -334,16 +362,14 @@ def _from_file(node: NodeContext, path: Path) -> Any:
         known = ", ".join((".xml", ".mjcf", *_DESCRIPTIONS))
         raise ModelError(f"{path}: a model is a file in MJCF, URDF or SDF ({known})")
     try:
-        described = _DESCRIPTIONS[kind](path, _finder(node))
+        described = _DESCRIPTIONS[kind](path, _finder(description))
     except DescriptionError as error:
         raise ModelError(str(error)) from error
     if described.not_taken:
         count = sum(note.count for note in described.not_taken)
         rows = "".join(f"\n  {note}" for note in described.not_taken)
         things = "1 thing is" if count == 1 else f"{count} things are"
-        node.get_logger().warning(
-            f"{path.name}: {things} not converted, or converted differently:{rows}"
-        )
+        warn(f"{path.name}: {things} not converted, or converted differently:{rows}")
     return described.spec
 
 
