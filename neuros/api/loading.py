@@ -10,6 +10,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -33,10 +34,11 @@ from neuros.recording.provenance import seeds
 
 _LONG_BYTES = 1 << 20
 """A file of a container's folder from this size on is data, not a recipe."""
+_CLOSE = 0.8  # difflib's similarity of besides and beside
 _MJCF = (".xml", ".mjcf")
 _MODELS = (*_MJCF, ".urdf", ".sdf", ".world")
 _PLACE = re.compile(r"(\S.*?):(\d+):(\d+): (.*)")
-_LINE = re.compile(r"\bline (\d+)")
+_LINE = re.compile(r"\bline (?:number=)?(\d+)", re.IGNORECASE)
 
 
 def load_with_messages(
@@ -219,15 +221,21 @@ def _lacking(node: Node, project: Project, messages: Messages) -> Iterator[Probl
                 if is_named and is_missing(top, folders):
                     continue
                 text = f"there is no module '{needed.name}'"
-                beside = [file.stem for file in node.plugin.parent.glob("*.py")]
-                hint = did_you_mean(top, {*beside, *modules_here()} - {top})
-                hint = hint or (
-                    f"packages such as {top} go into the requirements.txt of the node's container,"
-                    " modules of your own beside the plugin: docs/environments.md"
-                )
+                hint = _place_of_module(top, node)
             if text:
                 place = needed.line, needed.column
                 yield Problem(display_name(part.path), *place, "", text, hint)
+
+
+def _place_of_module(name: str, node: Node) -> str:
+    """A hint for a module that is not there."""
+    beside = {file.stem for file in node.plugin.parent.glob("*.py")}
+    if close := get_close_matches(name, {*beside, *modules_here()} - {name}, 1, _CLOSE):
+        return f"did you mean '{close[0]}'?"
+    return (
+        f"packages such as {name} go into the requirements.txt of the node's container, modules of"
+        " your own beside the plugin: docs/environments.md"
+    )
 
 
 # ---------------------------------------------------------------------- slow checks

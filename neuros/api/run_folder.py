@@ -60,7 +60,7 @@ def make_run_folder(output: str | os.PathLike[str] | None, project_name: str) ->
         folder.mkdir(0o700, parents=True, exist_ok=output is not None)
     except OSError as error:
         raise UsageError(
-            f"the run folder {folder} cannot be made ({error.strerror}): name one with -o"
+            f"the run folder {folder} cannot be made ({error.strerror}): name another with -o"
         ) from error
     return folder
 

@@ -282,7 +282,7 @@ def _project_file(path: Path) -> Path:
     file = path.parent.resolve() / path.name
     if not file.exists():
         names = (entry.name for entry in file.parent.glob("*"))
-        hint = did_you_mean(file.name, names)
+        hint = did_you_mean(file.name, names) or f"the current folder is {Path.cwd()}"
         problem = Problem(display_name(file), 0, 0, "", "there is no such file", hint)
         raise ProjectError([problem])
     if file.suffix == ".py":

@@ -28,16 +28,23 @@ class Loop:
     Attributes:
         started_by: the hooks that send there without having received from there, in words; empty
             if that is nobody, ``None`` if it is not known.
+        may_stop_at: its connections that may lose the packet for which all of it waits.
     """
 
     nodes: tuple[str, ...]
     started_by: tuple[str, ...] | None
+    may_stop_at: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        starters = "it is not known by whom" if self.started_by is None else "nobody"
-        return f"loop of {', '.join(self.nodes)}: started by " + (
-            " and ".join(self.started_by) if self.started_by else starters
-        )
+        who = " and ".join(self.started_by or ("nobody",))
+        started = "by whom it is started is not known" if self.started_by is None else ""
+        text = f"loop of {', '.join(self.nodes)}: {started or f'started by {who}'}"
+        if self.may_stop_at:
+            text += (
+                f"; it stops for good if a packet is lost on {' or '.join(self.may_stop_at)}"
+                ' (add "discard_limit": 0)'
+            )
+        return text
 
 
 class _Hook(NamedTuple):
@@ -83,7 +90,9 @@ class Loops:
         for each in self._connections:
             to.setdefault(each.source_node, set()).add(each.destination_node)
         rings = _rings([*self._nodes], lambda name: to.get(name, ()))
-        return tuple(Loop(tuple(ring), self._starters({*ring})) for ring in rings)
+        return tuple(
+            Loop(tuple(ring), self._starters({*ring}), self._losers({*ring})) for ring in rings
+        )
 
     def problems(self) -> Iterator[Problem]:
         """The loops in which every hook waits for another one."""
@@ -152,18 +161,39 @@ class Loops:
                         yield other, port
 
     def _starters(self, ring: set[str]) -> tuple[str, ...] | None:
-        inside = [c for c in self._connections if {c.source_node, c.destination_node} <= ring]
-        sent = {(c.source_node, c.source_output) for c in inside}
-        taken = {(c.destination_node, c.destination_input) for c in inside}
         found = tuple(
             f"{_KINDS[hook.declared.kind]} '{hook.declared.name}' of {hook.node}"
+            for hook in self._starting(ring)
+        )
+        return found or (None if ring & self._unknown else ())
+
+    def _starting(self, ring: set[str]) -> list[_Hook]:
+        """The hooks that send into a ring without having received from it."""
+        inside = self._inside(ring)
+        sent = {(c.source_node, c.source_output) for c in inside}
+        taken = {(c.destination_node, c.destination_input) for c in inside}
+        return [
+            hook
             for node in sorted(ring)
             for hook in self._hooks[node]
             if hook in self._running
             and any((node, output) in sent for output in hook.outputs)
             and not any((node, port.name) in taken for port in self._needs(hook))
+        ]
+
+    def _losers(self, ring: set[str]) -> tuple[str, ...]:
+        """Where a loss ends a ring: in one that only initialise hooks start, once."""
+        kinds = {hook.declared.kind for hook in self._starting(ring)}
+        if ring & self._unknown or kinds != {"neuros_initialise"}:
+            return ()
+        return tuple(
+            str(c)
+            for c in self._inside(ring)
+            if not c.is_reliable and c.source_node != c.destination_node
         )
-        return found or (None if ring & self._unknown else ())
+
+    def _inside(self, ring: set[str]) -> list[Connection]:
+        return [c for c in self._connections if {c.source_node, c.destination_node} <= ring]
 
 
 def _hooks_of(node: Node) -> Sequence[DeclaredHook] | None:

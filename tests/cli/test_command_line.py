@@ -221,7 +221,7 @@ def test_a_folder_that_cannot_be_written_to_is_one_sentence(
     os.chdir("/proc")  # where even root can make no folder
     assert main(["launch", str(project)]) == 2
     error = capsys.readouterr().err
-    assert re.search(r"cannot be made \(.+\): name one with -o", error)
+    assert re.search(r"cannot be made \(.+\): name another with -o", error)
 
 
 def test_nor_one_that_is_no_folder(project: Path, capsys: pytest.CaptureFixture[str]) -> None:

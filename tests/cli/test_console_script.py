@@ -131,3 +131,16 @@ assert program.main(["example"]) == 0
 assert gc.isenabled() and gc.get_freeze_count() > 10_000
 """
     subprocess.run([sys.executable, "-c", program], stdout=subprocess.DEVNULL, check=True)
+
+
+def test_a_python_without_neuros_says_what_to_run(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys._base_executable, "-I", SCRIPT, "ps"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.endswith(f"run {SCRIPT} by itself, without a Python before it\n")
+    assert "Traceback" not in done.stderr

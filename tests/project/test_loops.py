@@ -115,3 +115,16 @@ def test_functions_of_a_module_beside_the_plugin_start_nothing(tmp_path: Path) -
 def test_a_long_row_of_nodes_is_followed_to_its_end(tmp_path: Path) -> None:
     loops = ring(tmp_path, *[PASS_ON] * 60, PASS_ON + BEGIN)
     assert not [*loops.problems()]
+
+
+@pytest.mark.parametrize(("starter", "is_said"), [(PASS_ON + BEGIN, True), (SOMETIMES, False)])
+def test_where_a_lost_packet_ends_a_loop_that_starts_once_is_said(
+    tmp_path: Path, starter: str, is_said: bool
+) -> None:
+    ring(tmp_path, PASS_ON, starter)
+    project = json.loads((tmp_path / "project.json").read_text())
+    del project["connections"][1]["discard_limit"]
+    (tmp_path / "project.json").write_text(json.dumps(project))
+    (loop,) = Loops(load_project(tmp_path, workspace=tmp_path).project).found
+    said = 'stops for good if a packet is lost on n1.out -> n0.in (add "discard_limit": 0)'
+    assert (said in str(loop)) is is_said
