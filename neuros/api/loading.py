@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 
 from neuros.api.plan import make_environments
@@ -78,7 +79,7 @@ def load_with_messages(
         *_unknown_types(loaded, workspaces),
         *_unknown_plugins(loaded),
         *_network_doubts(loaded),
-        *(foreseen_failures(loaded.project, messages) if reads_plugins else ()),
+        *(foreseen_failures(loaded.project, messages, looks_beside=False) if reads_plugins else ()),
     )
     return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
 
@@ -174,25 +175,30 @@ def workspaces_of(project: Path) -> Workspaces:
 # ---------------------------------------------------------------------- what would fail
 
 
-def foreseen_failures(project: Project, messages: Messages) -> list[Problem]:
+def foreseen_failures(
+    project: Project, messages: Messages, *, looks_beside: bool = True
+) -> list[Problem]:
     """What does not keep a run from starting, but from going well: it will fail, or do nothing.
 
     ``validate`` refuses it. Before a run these are warnings, since what is in an image is not
     known here.
+
+    Args:
+        looks_beside: also at what the modules beside a plugin import, which takes a while.
     """
     return [
         *_unknown_containers(project),
         *Loops(project).problems(),
-        *_missing_modules(project, messages),
+        *_missing_modules(project, messages, looks_beside),
     ]
 
 
-def _missing_modules(project: Project, messages: Messages) -> list[Problem]:
+def _missing_modules(project: Project, messages: Messages, looks_beside: bool) -> list[Problem]:
     """What plugins import, and the Python that they run on lacks."""
     lacking = {
         node.name: found
         for node in project.nodes
-        if node.script is None and (found := [*_lacking(node, project, messages)])
+        if node.script is None and (found := [*_lacking(node, project, messages, looks_beside)])
     }
     if not lacking:
         return []
@@ -203,12 +209,14 @@ def _missing_modules(project: Project, messages: Messages) -> list[Problem]:
     return [each for name, of in lacking.items() if name not in elsewhere for each in of]
 
 
-def _lacking(node: Node, project: Project, messages: Messages) -> Iterator[Problem]:
+def _lacking(
+    node: Node, project: Project, messages: Messages, looks_beside: bool
+) -> Iterator[Problem]:
     path = node.environment.get("PYTHONPATH", "").split(os.pathsep)
     folders = [str(node.plugin.parent), *filter(None, path), *map(str, messages.paths)]
     built = {each.package for each in messages.built}
     container = find_container(node.container, project.folder)
-    for part in _parts(node.plugin):
+    for part in islice(_parts(node.plugin), None if looks_beside else 1):
         for needed in part.needs:
             top = needed.name.partition(".")[0]
             text = ""

@@ -73,7 +73,13 @@ class Loops:
         for connection in project.connections:
             end = connection.destination_node, connection.destination_input
             self._to.setdefault(end, []).append(connection)
-        hooks = {node.name: _hooks_of(node) for node in project.nodes}
+        to: dict[str, set[str]] = {}
+        for each in project.connections:
+            to.setdefault(each.source_node, set()).add(each.destination_node)
+        self._takers = to
+        self._rings = _rings([*self._nodes], lambda name: to.get(name, ()))
+        # Without a loop nothing is to be told of the hooks, and no plugin need be read.
+        hooks = {node.name: _hooks_of(node) if self._rings else () for node in project.nodes}
         self._unknown = {name for name, found in hooks.items() if found is None}
         self._hooks = {
             name: [_Hook(name, each) for each in found or () if each.kind in _KINDS]
@@ -86,12 +92,9 @@ class Loops:
     @cached_property
     def found(self) -> tuple[Loop, ...]:
         """All loops of the project."""
-        to: dict[str, set[str]] = {}
-        for each in self._connections:
-            to.setdefault(each.source_node, set()).add(each.destination_node)
-        rings = _rings([*self._nodes], lambda name: to.get(name, ()))
         return tuple(
-            Loop(tuple(ring), self._starters({*ring}), self._losers({*ring})) for ring in rings
+            Loop(tuple(ring), self._starters({*ring}), self._losers({*ring}))
+            for ring in self._rings
         )
 
     def problems(self) -> Iterator[Problem]:
@@ -125,16 +128,15 @@ class Loops:
 
     def _find_running(self) -> None:
         waiting = [hook for hooks in self._hooks.values() for hook in hooks]
-        takers: dict[str, set[str]] = {}
-        for each in self._connections:
-            takers.setdefault(each.source_node, set()).add(each.destination_node)
         while waiting:
             hook = waiting.pop()
             if hook in self._running or any(self._lacks(hook.node, p) for p in self._needs(hook)):
                 continue
             self._running.add(hook)
             self._live |= {(hook.node, output) for output in hook.outputs}
-            waiting += [each for node in takers.get(hook.node, ()) for each in self._hooks[node]]
+            waiting += [
+                each for node in self._takers.get(hook.node, ()) for each in self._hooks[node]
+            ]
 
     def _needs(self, hook: _Hook) -> list[DeclaredPort]:
         clock = self._nodes[hook.node].clock

@@ -177,7 +177,7 @@ def is_missing(name: str, folders: Sequence[str]) -> bool:
     Nothing is imported. Where a package may make its modules when it is imported, all are there.
     """
     top = name.partition(".")[0]
-    if top in sys.stdlib_module_names:
+    if top in sys.stdlib_module_names or name in sys.modules:
         return False
     found = [PathFinder.find_spec(top, folders)]
     for each in [*accumulate(name.split("."), "{}.{}".format)][1:] if found[0] else ():
