@@ -1,9 +1,10 @@
-"""Version and folders of the NeuROS that is imported, and the commands that add to it.
+"""Version and folders of the NeuROS that is imported, and the commands of its programs.
 
 A checkout has the folders of data at its top, and links to them in the package; an installed
 package has the folders themselves.
 """
 
+import sys
 from pathlib import Path
 
 __version__ = "2.0.0"
@@ -22,6 +23,29 @@ EXAMPLES = (PACKAGE / "examples").resolve()
 
 WORKSPACE = (PACKAGE / "workspace").resolve()
 """``@path`` in project files is relative to it."""
+
+
+# With -m or -c, Python puts the current folder before all others on its path, and would import from
+# there what anybody has left. Its option -P is of Python 3.11, -I leaves out PYTHONPATH and the
+# user's packages, and PYTHONSAFEPATH would reach the programs that a plugin starts.
+_LEAVE_OUT_FOLDER = "import sys; sys.path[:1] == [''] and sys.path.pop(0)"
+_RUN_MODULE = "import runpy; runpy.run_module(sys.argv.pop(1), None, '__main__', True)"
+
+
+def python_command(
+    *arguments: str, python: object = sys.executable, code: str = _RUN_MODULE
+) -> list[str]:
+    """The command of a Python that imports nothing from the current folder.
+
+    Each Python that NeuROS starts is started with it, or isolated (``-I``).
+
+    Args:
+        arguments: the module to run (``neuros.cli``), then its arguments; with ``code``: those of
+            the code.
+        python: the program.
+        code: what to run in place of a module; it begins with a simple statement.
+    """
+    return [str(python), "-c", f"{_LEAVE_OUT_FOLDER}; {code}", *arguments]
 
 
 def install_command(extra: str = "") -> str:

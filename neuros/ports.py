@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,6 +10,7 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
+from neuros.distribution import python_command
 from neuros.errors import EnvironmentFault
 from neuros.options import Option
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port, Project
@@ -454,7 +454,7 @@ class NodeProgram:
     reaper: Reaper | None = None
     environ: Mapping[str, str] = field(default_factory=dict)
     is_isolated: bool = False
-    program: Sequence[str] = (sys.executable, "-m", "neuros.cli", "node")
+    program: Sequence[str] = field(default_factory=lambda: python_command("neuros.cli", "node"))
 
     def command(self, python: Sequence[str] = ()) -> tuple[str, ...]:
         """The command on this Python, or on the one that ``python`` starts."""

@@ -6,6 +6,7 @@ The table is that of the architecture.
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -367,3 +368,70 @@ def _is_script_part(node: ast.stmt) -> bool:
     if isinstance(node, ast.If):
         return ast.unparse(node.test) == "__name__ == '__main__'"
     return isinstance(node, ast.FunctionDef) and node.name == "console_script"
+
+
+def pythons_started_otherwise(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Commands that start Python so that it may import from the current folder.
+
+    Only :func:`neuros.distribution.python_command` starts modules and code; a Python that is
+    isolated, or is given a file, takes nothing from there.
+    """
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.List, ast.Tuple)):
+            parts = [ast.unparse(part) for part in node.elts]
+            is_shell = parts[:1] in (["'/bin/sh'"], ["'sh'"], ["'/bin/bash'"])
+            is_file = len(parts) > 1 and (".py" in parts[1] or "__file__" in parts[1])
+            is_compiler, is_text = "'-o'" in parts, parts[1:2] == ["sys.version"]
+            is_python = not {"'-m'", "'-c'", "sys.executable"}.isdisjoint(parts)
+            is_other = is_shell or is_file or is_compiler or is_text
+            if is_python and not (is_other or "'-I'" in parts):
+                yield node.lineno, ast.unparse(node)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            if re.search(r"\bpython[\d.]* -[mc]\b", node.value):
+                yield node.lineno, node.value
+        elif isinstance(node, ast.Call) and re.search(
+            r"\b(exec[lv]\w*|spawn[lv]\w*|set_executable)$", ast.unparse(node.func)
+        ):
+            if any("sys.executable" in ast.unparse(argument) for argument in node.args):
+                yield node.lineno, ast.unparse(node)
+
+
+def test_one_function_starts_every_python() -> None:
+    assert [
+        (str(path.relative_to(ROOT)), *found)
+        for path in [*FILES, ROOT / "install.py"]
+        for found in pythons_started_otherwise(ast.parse(path.read_text("utf-8")))
+        if path.name != "distribution.py"
+    ] == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "subprocess.run([sys.executable, '-m', 'neuros.cli'])",
+        "command = [str(python), '-m', 'pip']",
+        "command = [python, '-c', code]",
+        "command = ('-m', 'venv')",
+        "command = [sys.executable, *arguments]",
+        "os.system('python3 -m neuros.cli ps')",
+        "f'exec {python}; python -c {code}'",
+        "os.execve(sys.executable, command, environment)",
+    ],
+)
+def test_another_way_to_start_python_is_seen(source: str) -> None:
+    assert [*pythons_started_otherwise(ast.parse(source))]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "[sys.executable, '-I', '-S', '-c', code]",
+        "[sys.executable, str(root / 'tests' / 'needs.py'), '--install']",
+        "['/bin/sh', '-c', code]",
+        "option('-m', '--monitor-system-load')",
+        "f'there is no module {name} for {sys.executable}'",
+        "python_command('neuros.cli', 'ps', python=sys.executable)",
+    ],
+)
+def test_what_imports_nothing_from_the_current_folder_is_allowed(source: str) -> None:
+    assert [*pythons_started_otherwise(ast.parse(source))] == []

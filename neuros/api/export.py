@@ -38,7 +38,7 @@ from neuros.api.request import ExportOptions, check_names, parse_duration
 from neuros.backends.containers import bare_name, files_of, find_recipe
 from neuros.backends.domain import valid_domain
 from neuros.backends.node_command import THREAD_VARIABLES
-from neuros.distribution import PACKAGE, WORKSPACE
+from neuros.distribution import PACKAGE, WORKSPACE, python_command
 from neuros.errors import ProjectError, UsageError
 from neuros.executors.executor import JobResources
 from neuros.executors.slurm import slurm_script
@@ -66,6 +66,9 @@ _MOST_MACHINES = 65_536  # no cluster has more
 # What the launcher of a node imports, and images of nodes lack: pure Python, in one folder.
 _VENDORED = "tabulate"
 
+_ENTRYPOINT = json.dumps(
+    python_command("neuros.cli", "part", str(ROOT / NODES_FILE), python="python3")
+)
 _DOCKERFILE = f"""\
 # The image of a container, and on top of it NeuROS and the project. It takes no network.
 ARG BASE
@@ -74,7 +77,7 @@ COPY image {ROOT}
 ENV HOME=/tmp XDG_CACHE_HOME=/tmp/.cache PYTHONUNBUFFERED=1 PYTHONPATH={{path}} {{threads}}
 USER 1000:1000
 WORKDIR {ROOT}
-ENTRYPOINT ["python3", "-m", "neuros.cli", "part", "{ROOT / NODES_FILE}"]
+ENTRYPOINT {_ENTRYPOINT}
 """
 
 

@@ -19,7 +19,7 @@ from neuros.api.plan import make_environments
 from neuros.backends.containers import BASE, OWN_FOLDER, find_container, why_no_container
 from neuros.backends.node_command import signal_in_words, without_mark
 from neuros.backends.pythons import Pythons
-from neuros.distribution import WORKSPACE, install_command
+from neuros.distribution import WORKSPACE, install_command, python_command
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
@@ -291,7 +291,9 @@ def _import(python: Path, name: str, path: Path, overrides: Sequence[str]) -> st
     """What is wrong with the plugin of a node; what it prints goes to standard error."""
     settings = [part for text in overrides for part in ("--set", text)]
     reading, writing = os.pipe()
-    command = [str(python), "-m", "neuros.cli", "import-plugin", name, str(path), *settings]
+    command = python_command(
+        "neuros.cli", "import-plugin", name, str(path), *settings, python=python
+    )
     command += ["--answer", str(writing)]
     with tempfile.TemporaryDirectory(prefix="neuros-") as folder:
         environment = {**without_mark(os.environ), "TMPDIR": folder}

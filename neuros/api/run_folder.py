@@ -17,7 +17,6 @@ import json
 import os
 import platform
 import secrets
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -29,7 +28,7 @@ from typing import Any
 from neuros.api.plan import Plan
 from neuros.backends.reaper import Reaper
 from neuros.backends.sidecars import Recorded, RecorderProcess
-from neuros.distribution import WORKSPACE, __version__
+from neuros.distribution import WORKSPACE, __version__, python_command
 from neuros.errors import UsageError
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_text, project_to_json
@@ -150,7 +149,7 @@ class Recording:
             raise UsageError(
                 f"{run} cannot be written to ({error.strerror}): name another folder with -o"
             ) from error
-        command = [sys.executable, "-m", "neuros.cli", "recorder", str(run)]
+        command = python_command("neuros.cli", "recorder", str(run))
         self._process = RecorderProcess(command, run, log_of(run), environment)
         reaper.watch(self._process.pid)
 

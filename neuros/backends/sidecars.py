@@ -27,14 +27,16 @@ _LOOK_S = 0.1
 def start_sidecar(
     what: str,
     command: Sequence[str],
-    run: Path,
     log: Path,
     environment: Mapping[str, str],
     pass_fds: Sequence[int] = (),
     *,
     is_ours: bool = True,
 ) -> subprocess.Popen[bytes]:
-    """Start a program in the run folder, in a session of its own, at lower priority than nodes.
+    """Start a program beside a run, in a session of its own, at lower priority than nodes.
+
+    Its current folder is ``/``: nodes may write to the run folder, and Python may import from the
+    current one.
 
     Args:
         what: its name, for messages.
@@ -53,7 +55,7 @@ def start_sidecar(
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=file,
-                cwd=run,
+                cwd="/",
                 env=with_libraries(whole) if is_ours else whole,
                 start_new_session=True,
                 pass_fds=tuple(pass_fds),
@@ -119,7 +121,7 @@ class RecorderProcess:
 
     def _start(self) -> subprocess.Popen[bytes]:
         # The nodes come first: what the recorder has not got to waits for it on the disk.
-        return start_sidecar("recorder", self._command, self._run, self._log, self._environment)
+        return start_sidecar("recorder", self._command, self._log, self._environment)
 
     def _finish(self, is_given_up: Callable[[], bool]) -> Recorded | None:
         """Its last report, ``None`` if it makes none."""

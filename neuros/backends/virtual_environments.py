@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING
 
 from neuros.backends.containers import ContainerFolder
 from neuros.caching import UNUSED_S, Kept, cache_root, kept_in
-from neuros.distribution import PACKAGE, install_command
+from neuros.distribution import PACKAGE, install_command, python_command
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import clean_environment, dotted
 from neuros.installation.packages import (
@@ -219,7 +219,7 @@ def _make_venv(choice: Choice, progress: Progress, run_environment: Mapping[str,
         )
     # A layer finds pip where it finds the rest.
     options = ["--without-pip"] if choice.is_layered and _is_here("pip") else []
-    command = [str(choice.base), "-m", "venv", *options, str(folder)]
+    command = python_command("venv", *options, str(folder), python=choice.base)
     if why := make_venv(command, {**os.environ, **run_environment}):
         raise _fault(choice, why)
 

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.distribution import python_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.suggest import counted
 
@@ -201,7 +202,7 @@ def _replay_node(options: argparse.Namespace) -> int:
         return ended
     folder = _folder(options.output)
     file = replace(file, folders=replace(file.folders, run=folder))
-    command = [str(python), "-m", "neuros.cli", "replayed", "--run", str(run.folder)]
+    command = python_command("neuros.cli", "replayed", "--run", str(run.folder), python=python)
     command += ["--pdb"] if options.pdb else []
     command += ["--debugpy", str(options.debugpy)] if options.debugpy is not None else []
     command += [] if options.output else ["--remove"]

@@ -24,7 +24,7 @@ from neuros.api.loading import load_with_messages
 from neuros.backends.domain import choose_domain
 from neuros.backends.machines.deployment import Machines
 from neuros.backends.node_command import usable_cores
-from neuros.distribution import install_command
+from neuros.distribution import install_command, python_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine, answer_of, install_opengl, offscreen_opengl
 from neuros.ports import Finding, SimulatorKind, State
@@ -230,7 +230,7 @@ def prove_rendering(environ: Mapping[str, str]) -> Finding:
     if find_spec("mujoco") is None:
         return Finding.absent(subject, "not tried without MuJoCo")
     program = "from neuros.simulators.mujoco import cameras; exit(cameras.render_one_picture())"
-    done = answer_of([sys.executable, "-c", program], environ, _RENDERING_TIMEOUT_S)
+    done = answer_of(python_command(code=program), environ, _RENDERING_TIMEOUT_S)
     if done is None:
         return Finding.bad(
             subject, f"no picture after {_RENDERING_TIMEOUT_S:g} s", install_opengl()
@@ -254,7 +254,7 @@ def prove_delivery(
     subject, name = "delivery", where or backend
     with tempfile.TemporaryDirectory(prefix="neuros-doctor-") as folder:
         run = Path(folder) / "run"
-        command = [sys.executable, "-m", "neuros.cli", "launch", str(project)]
+        command = python_command("neuros.cli", "launch", str(project))
         command += ["--backend", backend, "-o", str(run), *options]
         with subprocess.Popen(
             command,

@@ -131,6 +131,7 @@ def _parameters(partition: str | None, plan: SweepPlan) -> dict[str, Any]:
         "cpus_per_task": needs.cpus,
         "srun_args": cpus,  # from 22.05 on, srun does not take it from its job
         "additional_parameters": {
+            "chdir": "/",  # Python would import from the folder that the job begins in
             **({"mem": f"{-(-needs.mem_bytes // _MEBIBYTE)}M"} if needs.mem_bytes else {}),
             **({"gpus-per-node": needs.gpus} if needs.gpus else {}),
         },

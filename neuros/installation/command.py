@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+from neuros.distribution import python_command
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import (
     NEWEST,
@@ -204,7 +205,7 @@ def build_containers(python: Path, options: argparse.Namespace) -> int:
     Where nothing was asked for by name, a machine without Docker gets a line about it, and that is
     all.
     """
-    command = [str(python), "-m", "neuros.cli", *build_arguments(options)]
+    command = python_command("neuros.cli", *build_arguments(options), python=python)
     return subprocess.call(command, env=clean_environment(os.environ))
 
 
@@ -213,7 +214,7 @@ def build_messages(python: Path, root: Path) -> int:
 
     A machine without a C compiler gets a line about it, and that is all.
     """
-    command = [str(python), "-m", "neuros.cli", "build", "--if-compiler"]
+    command = python_command("neuros.cli", "build", "--if-compiler", python=python)
     return subprocess.call(command, cwd=root, env=clean_environment(os.environ))
 
 
@@ -334,7 +335,9 @@ class Environment:
 
         What cannot be compiled, or written, Python compiles at each start: no fault.
         """
-        command = [str(self.python), "-m", "compileall", "-qq", str(self._root / "neuros")]
+        command = python_command(
+            "compileall", "-qq", str(self._root / "neuros"), python=self.python
+        )
         subprocess.run(command, env=clean_environment(os.environ), check=False)
 
     def python_version(self) -> tuple[int, int] | None:
@@ -355,7 +358,8 @@ class Environment:
         self._progress.step(f"making .venv with Python {platform.python_version()}")
         # Inside a virtual environment (even the one to be replaced) venv needs the base Python.
         base = getattr(sys, "_base_executable", sys.executable)
-        if why := make_venv([base, "-m", "venv", "--clear", str(self.folder)], os.environ):
+        command = python_command("venv", "--clear", str(self.folder), python=base)
+        if why := make_venv(command, os.environ):
             shutil.rmtree(self.folder, ignore_errors=True)
             raise EnvironmentFault(f".venv cannot be made: {why}; then install.py again")
         return sys.version_info[:2]
@@ -399,7 +403,7 @@ class Environment:
     def _run(self, code: str) -> subprocess.CompletedProcess[str]:
         """Run ``code`` in its Python, from a folder that holds no modules."""
         return subprocess.run(
-            [str(self.python), "-c", code],
+            python_command(code=code, python=self.python),
             cwd=self.folder,
             # NEST fixes the number of its threads when it is imported.
             env={**clean_environment(os.environ), "OMP_NUM_THREADS": "1"},

@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from neuros.distribution import python_command
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import (
     IN_DOCKER,
@@ -33,7 +34,7 @@ LOCKS = "requirements"
 UV = "uv>=0.9,<1"
 
 _PIP_INSTALL = (
-    *("-m", "pip", "install", "--disable-pip-version-check", "--no-input"),
+    *("pip", "install", "--disable-pip-version-check", "--no-input"),
     *("--progress-bar", "off", "--only-binary", ":all:"),
 )
 # As pip: every index counts, and modules are compiled, so that no start has to.
@@ -187,7 +188,7 @@ class Installer:
         if found := find_uv(self.python):
             return found
         self.progress.detail("installing uv")
-        self._run([str(self.python), *_PIP_INSTALL, *what], self.environ)
+        self._run(python_command(*_PIP_INSTALL, *what, python=self.python), self.environ)
         return self.python.with_name("uv")
 
     def install(self, arguments: Sequence[str], python: Path | None = None) -> str:

@@ -1,7 +1,7 @@
 """Generates C and Python from definitions with rosidl's generators, called as CMake calls them.
 
 They print to standard output, replace it, and keep state in modules: they run in a process of
-their own, ``python -m neuros.messages.generation``, which reads what to do from standard input.
+their own, an isolated Python, which reads what to do from standard input.
 Each has a folder of its own, since their files collide.
 """
 

@@ -19,7 +19,6 @@ import json
 import re
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ import pytest
 
 from neuros.backends.run_processes import RunProcesses
 from neuros.backends.sessions import sessions
+from neuros.distribution import python_command
 
 PROJECTS = Path(__file__).with_name("projects").resolve()
 COUNT = 200
@@ -72,7 +72,7 @@ class Launched:
 def launcher(project: Path, folder: Path, *arguments: str) -> subprocess.Popen[str]:
     """``neuros launch`` in a session of its own; the run goes into ``folder``."""
     return subprocess.Popen(
-        [sys.executable, "-m", "neuros.cli", "launch", str(project), "-o", str(folder), *arguments],
+        python_command("neuros.cli", "launch", str(project), "-o", str(folder), *arguments),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

@@ -7,7 +7,6 @@ import json
 import secrets
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.util import find_spec
@@ -15,7 +14,7 @@ from typing import Any
 from urllib.parse import quote, urlsplit
 
 from neuros.backends.sidecars import start_sidecar
-from neuros.distribution import install_command
+from neuros.distribution import install_command, python_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import BackEnd, Reaper
 from neuros.project.dashboard import ARRAYS, IMAGES, SPIKES
@@ -65,10 +64,10 @@ class _DashboardView:
         self._url = f"http://{HOST}:{self._listening.getsockname()[1]}/?token={self._token}"
 
     def start(self, run: Shown, reaper: Reaper) -> str:
-        command = [sys.executable, "-m", "neuros.cli", "dashboard", str(run.folder)]
+        command = python_command("neuros.cli", "dashboard", str(run.folder))
         descriptor, log = self._listening.fileno(), run.folder / "dashboard.log"
         self._process = process = start_sidecar(
-            "dashboard", command, run.folder, log, run.environment, [descriptor]
+            "dashboard", command, log, run.environment, [descriptor]
         )
         reaper.watch(process.pid)
         self._listening.close()
@@ -111,14 +110,14 @@ class _RerunView:
         self._processes: list[subprocess.Popen[bytes]] = []
 
     def start(self, run: Shown, reaper: Reaper) -> str:
-        server = [sys.executable, "-m", "rerun", "--serve-web", "--bind", HOST]
+        server = python_command("rerun", "--serve-web", "--bind", HOST)
         server += ["--port", str(self._feed_port), "--web-viewer-port", str(self._web_port)]
         server += ["--server-memory-limit", _RERUN_MEMORY, "--hide-welcome-screen"]
         server += ["--newest-first"]  # who opens it late wants to see what is now
-        feeder = [sys.executable, "-m", "neuros.cli", "view", str(run.folder)]
+        feeder = python_command("neuros.cli", "view", str(run.folder))
         log = run.folder / "rerun.log"
         for what, command in (("server of Rerun", server), ("feeder of Rerun", feeder)):
-            process = start_sidecar(what, command, run.folder, log, run.environment)
+            process = start_sidecar(what, command, log, run.environment)
             self._processes.append(process)
             reaper.watch(process.pid)
         _tell(

@@ -61,9 +61,7 @@ class ToolProcess:
 
     def __init__(self, program: str, command: Sequence[str], run: Shown) -> None:
         log = run.folder / f"{program}.log"
-        self._process = start_sidecar(
-            program, command, run.folder, log, run.environment, is_ours=False
-        )
+        self._process = start_sidecar(program, command, log, run.environment, is_ours=False)
 
     def announce(self, reaper: Reaper) -> None:
         """Have it ended if the launcher is killed."""

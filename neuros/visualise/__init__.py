@@ -43,6 +43,7 @@ from typing import Any
 
 import numpy as np
 
+from neuros.distribution import python_command
 from neuros.errors import EnvironmentFault
 
 __all__ = [
@@ -91,7 +92,7 @@ class _Feed:
         self._socket.setblocking(False)
         try:
             self._process: subprocess.Popen[bytes] = subprocess.Popen(
-                [sys.executable, "-m", "neuros.visualise.program"],
+                python_command("neuros.visualise.program"),
                 stdin=far_end.fileno(),
                 env={**os.environ, **_ENVIRONMENT},
             )

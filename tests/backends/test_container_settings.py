@@ -20,6 +20,7 @@ from neuros.backends.docker.settings import (
     outside,
 )
 from neuros.errors import EnvironmentFault
+from neuros.distribution import python_command
 from neuros.ports import NodeProgram
 from neuros.project.model import Access, Folders, Node, NodeFile, Resources
 
@@ -210,7 +211,9 @@ def test_it_executes_the_python_of_its_image_and_writes_its_own_log() -> None:
     assert found["entrypoint"][:2] == ["/bin/sh", "-c"]
     assert found["entrypoint"][3:] == [
         *("/neuros/run/snn/node.log", "/home/me/runs/1/snn/node.log"),
-        *("/opt/neuros/bin/python", "-m", "neuros.cli", "node", "/neuros/run/snn/node.json"),
+        *python_command(
+            "neuros.cli", "node", "/neuros/run/snn/node.json", python="/opt/neuros/bin/python"
+        ),
     ]
     assert found["working_dir"] == "/neuros/run"
 

@@ -57,7 +57,7 @@ def test_slurm_is_asked_for_whole_cores_mebibytes_and_gpus(tmp_path: Path) -> No
     assert asked["partition"] == "fast"
     assert asked["cpus_per_task"] == 3
     assert asked["srun_args"] == ["--cpus-per-task", "3"]
-    assert asked["additional_parameters"] == {"mem": "1025M", "gpus-per-node": 2}
+    assert asked["additional_parameters"] == {"chdir": "/", "mem": "1025M", "gpus-per-node": 2}
     assert asked["time"] is None, "the cluster decides"
 
 

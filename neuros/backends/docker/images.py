@@ -37,6 +37,7 @@ ADDED = "neuros_on"
 # Of all Pythons of the image the first with rclpy, else the first. A ROS distribution has to be
 # sourced for that. The proof is rclpy in use: without its middleware it imports nothing either.
 _PROBE = r"""
+cd /
 for setup in /opt/ros/*/setup.sh; do
   [ -f "$setup" ] && . "$setup" && export NEUROS_SETUP="$setup" && break
 done
@@ -70,7 +71,7 @@ class Image:
     Attributes:
         id: as the engine names it, ``sha256:...``.
         name: for people.
-        start: how its Python is started: ``[*start, "-m", "neuros.cli", "node", ...]``.
+        start: how its Python is started: its options follow.
         python_version: of that Python, as ``(3, 12)``.
         notice: one sentence if something about it should be said at each launch, else "".
     """

@@ -38,7 +38,7 @@ from neuros.backends.docker.engine import (
 from neuros.backends.docker.images import Image, image_for
 from neuros.backends.docker.settings import LIBRARY, MESSAGES, NETWORK_MODE, ROOT, limits
 from neuros.backends.node_command import DEFAULTS, without_mark
-from neuros.distribution import PACKAGE
+from neuros.distribution import PACKAGE, python_command
 from neuros.errors import EnvironmentFault
 from neuros.project.deployment import Host
 from neuros.project.model import Node, memory_text
@@ -201,7 +201,7 @@ class AgentContainer:
         self._container = engine.containers.create(
             image.id,
             name=f"neuros-{node.name}-{os.urandom(4).hex()}",
-            entrypoint=[*image.start, "-m", "neuros.cli", "agent", "--in-image"],
+            entrypoint=[*image.start, *python_command("neuros.cli", "agent", "--in-image")[1:]],
             command=[],
             environment={
                 **DEFAULTS,
