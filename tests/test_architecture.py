@@ -389,11 +389,12 @@ def pythons_started_otherwise(tree: ast.Module) -> Iterator[tuple[int, str]]:
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             if re.search(r"\bpython[\d.]* -[mc]\b", node.value):
                 yield node.lineno, node.value
-        elif isinstance(node, ast.Call) and re.search(
-            r"\b(exec[lv]\w*|spawn[lv]\w*|set_executable)$", ast.unparse(node.func)
+        elif (
+            isinstance(node, ast.Call)
+            and re.search(r"\b(exec[lv]\w*|spawn[lv]\w*|set_executable)$", ast.unparse(node.func))
+            and any("sys.executable" in ast.unparse(argument) for argument in node.args)
         ):
-            if any("sys.executable" in ast.unparse(argument) for argument in node.args):
-                yield node.lineno, ast.unparse(node)
+            yield node.lineno, ast.unparse(node)
 
 
 def test_one_function_starts_every_python() -> None:

@@ -19,8 +19,8 @@ from neuros.backends.docker.settings import (
     inside,
     outside,
 )
-from neuros.errors import EnvironmentFault
 from neuros.distribution import python_command
+from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.model import Access, Folders, Node, NodeFile, Resources
 
