@@ -417,11 +417,39 @@ class Launcher(Protocol):
         """One line per thing that :meth:`start` would start."""
 
 
+class ChildProcess(Protocol):
+    """A process that leads a session and a process group of its own."""
+
+    pid: int
+
+    def poll(self) -> int | None:
+        """``None`` while it runs, then its exit code, negative for a signal."""
+
+    def wait(self, timeout_s: float) -> None:
+        """Until it has ended, or ``timeout_s`` seconds have passed."""
+
+    def send_signal(self, number: int, *, is_for_group: bool = False) -> None:
+        """Send a signal to it, or to its process group; does nothing where it has ended."""
+
+
 class Reaper(Protocol):
     """Ends what is left of a run when its launcher has ended, be it by SIGKILL."""
 
+    def spawn(
+        self,
+        command: Sequence[str],
+        log: Path,
+        folder: Path,
+        environment: Mapping[str, str],
+        cores: Sequence[int] = (),
+    ) -> ChildProcess:
+        """Start a process in a session of its own, without input; its output goes to the log.
+
+        All that descends from it ends with the run. Raises ``OSError``.
+        """
+
     def watch(self, pid: int) -> None:
-        """Announce a process that leads a session of its own."""
+        """Announce another process, which leads a session of its own."""
 
     def remove_later(self, path: Path) -> None:
         """Have a file, socket or folder removed once all processes of the run are gone."""
@@ -442,7 +470,7 @@ class NodeProgram:
     Attributes:
         options: of the program, as ``--debug``.
         cores, pythons: by name, of nodes that ask for some, or do not run on this Python.
-        reaper: is told of all that is started; ``None`` where nothing is.
+        reaper: starts processes, and is told of all else that is; ``None`` where nothing is.
         environ: the environment of the launcher.
         is_isolated: whether the nodes are to have a network of their own.
         program: the command without its options; paths of ``node.json`` files follow these.

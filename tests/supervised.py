@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 import signal
 import sys
 import time
@@ -13,6 +14,7 @@ from typing import Any
 
 from neuros.backends.control_sockets import SOCKET_NAME, UnixListener
 from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher, RunningProcess
+from neuros.backends.reaper import Reaper
 from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
@@ -78,24 +80,27 @@ class Run:
         """Run nodes that do as the text under their names says, to the end."""
         files = [self.file(name, act, connections) for name, act in acts.items()]
         kind = InProcessLauncher if in_process else ProcessLauncher
-        supervisor = Supervisor(
-            files,
-            _Noting(kind(NodeProgram(program=HOST)), self.hosts),
-            {"ALL": " ".join(acts)} | ({"ACT": acts["all"]} if in_process else {}),
-            self.folder,
-            self.output,
-            self.signals,
-            listener=self.listener(self.folder),
-            duration_s=duration_s,
-            finalise_s=finalise_s,
-            peers=Peers("this run", elsewhere, files),
-            on_stop=on_stop,
-        )
-        start_s = time.monotonic()
-        outcome = supervisor.run()
-        self.lasted_s = time.monotonic() - start_s
-        for host in self.hosts:
-            assert host.wait(5.0) is not None, "nobody is left"
+        with contextlib.ExitStack() as stack:
+            reaper = Reaper.start(secrets.token_hex(8))
+            stack.callback(reaper.finish)
+            supervisor = Supervisor(
+                files,
+                _Noting(kind(NodeProgram(program=HOST, reaper=reaper)), self.hosts),
+                {"ALL": " ".join(acts)} | ({"ACT": acts["all"]} if in_process else {}),
+                self.folder,
+                self.output,
+                self.signals,
+                listener=self.listener(self.folder),
+                duration_s=duration_s,
+                finalise_s=finalise_s,
+                peers=Peers("this run", elsewhere, files),
+                on_stop=on_stop,
+            )
+            start_s = time.monotonic()
+            outcome = supervisor.run()
+            self.lasted_s = time.monotonic() - start_s
+            for host in self.hosts:
+                assert host.wait(5.0) is not None, "nobody is left"
         return outcome
 
     def clear(self) -> None:

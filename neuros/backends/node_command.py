@@ -18,7 +18,7 @@ import re
 import shlex
 import signal
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -310,21 +310,3 @@ def on_cores(cores: Cores | None) -> str:
 def usable_cores() -> frozenset[int]:
     """The cores that this process may use: ``taskset`` and control groups are respected."""
     return frozenset(os.sched_getaffinity(0))
-
-
-@contextlib.contextmanager
-def children_on(cores: Collection[int]) -> Iterator[None]:
-    """Processes that this thread starts inside get these cores, and so do all their threads.
-
-    The mask is there before the first instruction of the child: scripts, imports and the threads
-    of DDS have it, too. Without any nothing changes. Raises ``OSError`` for one that is not there.
-    """
-    if not cores:
-        yield
-        return
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, cores)
-    try:
-        yield
-    finally:
-        os.sched_setaffinity(0, before)

@@ -6,10 +6,7 @@ log itself, so that nothing passes through the launcher and nothing is lost when
 
 from __future__ import annotations
 
-import contextlib
-import os
 import signal
-import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,15 +14,14 @@ from typing import Any, TypeAlias
 from neuros.backends.node_command import (
     PROCESS_LOG,
     NodeProcess,
-    children_on,
     common_process,
     node_process,
     script_failure,
     signal_in_words,
 )
+from neuros.backends.reaper import UNKNOWN
 from neuros.errors import EnvironmentFault
-from neuros.ordinary_files import open_log
-from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram
+from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Reaper
 from neuros.project.model import Node, NodeFile, Project
 from neuros.stacks import ProcessThreads, threads_of
 
@@ -102,9 +98,8 @@ class ProcessLauncher:
         started: list[RunningProcess] = []
         try:
             for process in self._processes(nodes, environment):
-                started.append(RunningProcess(process))
-                if self._program.reaper:
-                    self._program.reaper.watch(started[-1].pid)
+                assert self._program.reaper is not None
+                started.append(RunningProcess(process, self._program.reaper))
         except BaseException:
             end_now(started)
             raise
@@ -142,22 +137,15 @@ class RunningProcess:
 
     is_abandoned = False
 
-    def __init__(self, process: NodeProcess) -> None:
+    def __init__(self, process: NodeProcess, reaper: Reaper) -> None:
         """Start it; raises ``EnvironmentFault`` if that is impossible."""
         self.names = process.names
         self._log = process.log
         try:
             process.log.parent.mkdir(parents=True, exist_ok=True)
-            with open_log(process.log) as output, children_on(process.cores):
-                self._process = subprocess.Popen(
-                    process.command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=output,
-                    stderr=output,
-                    cwd=process.folder,
-                    env=process.environment,
-                    start_new_session=True,
-                )
+            self._process = reaper.spawn(
+                process.command, process.log, process.folder, process.environment, process.cores
+            )
         except OSError as error:
             nodes = ", ".join(self.names)
             raise EnvironmentFault(f"cannot start the process of {nodes}: {error}") from error
@@ -168,26 +156,24 @@ class RunningProcess:
         code = self._process.poll()
         if code is None:
             return None
+        if code == UNKNOWN:
+            return "how is not known, since the reaper was killed"
         if code < 0:
             return signal_in_words(-code)
         return (script_failure(self._log) if code == 1 else None) or f"exit code {code}"
 
     def wait(self, timeout_s: float) -> str | None:
         """As :meth:`poll`, after it has ended or ``timeout_s`` seconds have passed."""
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout_s)
+        self._process.wait(timeout_s)
         return self.poll()
 
     def terminate(self) -> None:
         """Ask it to end (SIGTERM)."""
-        self._process.terminate()
+        self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
         """Kill it and its whole process group."""
-        # Once it has been reaped, its number may be another's.
-        if self._process.poll() is None:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(self.pid, signal.SIGKILL)
+        self._process.send_signal(signal.SIGKILL, is_for_group=True)
 
     def threads(self) -> ProcessThreads:
         """Where its threads stand in Python."""

@@ -11,15 +11,17 @@ import fcntl
 import importlib
 import json
 import os
+import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.run_processes import RunProcesses
 
-if TYPE_CHECKING:  # it takes longer to import
+if TYPE_CHECKING:  # they take longer to import
+    import subprocess
     from pathlib import Path
 
 READY = b"ready\n"
@@ -27,6 +29,10 @@ IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.
 KILL_DEADLINE_S = 20.0
 """A process in an uninterruptible system call outlasts even SIGKILL."""
 
+STARTED, FAILED, ENDED = "started", "failed", "ended"
+"""What the launcher hears of a process: its number, an ``OSError``, its exit code."""
+
+_PR_SET_CHILD_SUBREAPER = 36
 _GRACE_S = 4.5  # nodes have this long when the launcher died; all is gone within 6 s
 _POLL_S = 0.05
 _SETTLE_S = 0.5
@@ -65,38 +71,128 @@ class Orders:
 
 
 def main(run_id: str) -> None:
-    """Wait for the pipe on standard input to close, clean up."""
-    for number in IGNORED:
-        signal.signal(number, signal.SIG_IGN)
+    """Obey the launcher until the pipe on standard input closes, then clean up."""
+    for number in (*IGNORED, signal.SIGCHLD):
+        signal.signal(number, lambda *_: None)  # as SIG_IGN, which processes would inherit
     signal.pthread_sigmask(signal.SIG_UNBLOCK, IGNORED)  # the launcher had them wait
     orders = Orders()
-    processes = RunProcesses(run_id)
+    processes = RunProcesses(run_id, os.getpid())
+    children = _Children()
     os.write(1, READY)
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
     _import_the_rest()
-    for order, value in _read_orders():
+    for order, value in _read_orders(children):
         orders.take(order, value)
         if order == "session" and isinstance(value, int):
             processes.add_session(value)
+        elif order == "start" and isinstance(value, list):
+            children.start(*value)
+        elif order == "lock":
+            os.set_inheritable(orders.locks[-1][0], False)
         elif order == "clean":
             _cleaners(orders)
     clean_up(run_id, orders, processes)
 
 
-def _read_orders() -> Iterator[tuple[str, object]]:
-    with open(0, "rb", closefd=False) as pipe:
-        for line in pipe:
-            # A launcher that is killed while it writes leaves half a line.
-            with contextlib.suppress(ValueError, TypeError):
-                order, value = json.loads(line)
-                yield order, value
+class _Children:
+    """The processes that the launcher has had started here."""
+
+    def __init__(self) -> None:
+        self._launcher = os.getppid()
+        self._running: dict[int, subprocess.Popen[bytes]] = {}
+
+    def start(
+        self,
+        command: list[str],
+        log: str,
+        folder: str,
+        environment: dict[str, str],
+        cores: list[int],
+    ) -> None:
+        """Start one, and tell the launcher its number, or why not."""
+        import subprocess
+        from pathlib import Path
+
+        from neuros.ordinary_files import open_log
+
+        try:
+            with open_log(Path(log)) as output, children_on(cores):
+                process = subprocess.Popen(
+                    command,
+                    stdin=subprocess.DEVNULL,
+                    stdout=output,
+                    stderr=output,
+                    cwd=folder,
+                    env=environment,
+                    start_new_session=True,
+                )
+        except (OSError, ValueError) as error:  # a null byte in the environment, for instance
+            parts = getattr(error, "errno", None), getattr(error, "filename", None)
+            self._tell(FAILED, parts[0], getattr(error, "strerror", None) or str(error), parts[1])
+        else:
+            self._running[process.pid] = process
+            self._tell(STARTED, process.pid)
+
+    def reap(self) -> None:
+        """Tell the launcher which have ended; orphans of the run have come here, too."""
+        with contextlib.suppress(ChildProcessError):
+            while (ended := os.waitpid(-1, os.WNOHANG))[0]:
+                if process := self._running.pop(ended[0], None):
+                    process.returncode = os.waitstatus_to_exitcode(ended[1])
+                    self._tell(ENDED, process.pid, process.returncode)
+                    if os.getppid() == self._launcher:
+                        os.kill(self._launcher, signal.SIGCHLD)  # as its own children do
+
+    def _tell(self, *news: object) -> None:
+        with contextlib.suppress(OSError):  # the launcher has gone
+            os.write(1, json.dumps(news).encode() + b"\n")
+
+
+@contextlib.contextmanager
+def children_on(cores: Collection[int]) -> Iterator[None]:
+    """Processes that this thread starts inside get these cores, and so do all their threads.
+
+    The mask is there before the first instruction of the child: scripts, imports and the threads
+    of DDS have it, too. Without any nothing changes. Raises ``OSError`` for one that is not there.
+    """
+    before = os.sched_getaffinity(0)
+    if cores:
+        os.sched_setaffinity(0, cores)
+    try:
+        yield
+    finally:
+        if cores:
+            os.sched_setaffinity(0, before)
+
+
+def _read_orders(children: _Children) -> Iterator[tuple[str, object]]:
+    woken, waker = os.pipe()
+    os.set_blocking(waker, False)
+    signal.set_wakeup_fd(waker, warn_on_full_buffer=False)
+    rest = b""
+    while True:
+        ready, _, _ = select.select([0, woken], [], [])
+        if woken in ready:
+            os.read(woken, 4096)
+            children.reap()
+        if 0 not in ready:
+            continue
+        received = os.read(0, 65536)
+        if not received:
+            return
+        *lines, rest = (rest + received).split(b"\n")
+        yield from map(json.loads, lines)
 
 
 def _import_the_rest() -> None:
     """Now, and not when it is needed: who knows what becomes of the disk until then."""
     with contextlib.suppress(Exception):  # killing is the first duty, and needs none of it
-        import neuros.backends.shared_memory  # noqa: F401
+        import ctypes
+        import subprocess  # noqa: F401
+
+        # What a process of the run has left behind comes to this one: a daemon, for instance.
+        ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
+        import neuros.backends.shared_memory
+        import neuros.ordinary_files  # noqa: F401
 
 
 def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None) -> None:

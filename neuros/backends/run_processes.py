@@ -29,11 +29,15 @@ class _Process(NamedTuple):  # a dataclass would take the reaper 10 ms to import
 class RunProcesses:
     """The processes of one run, without the process that asks.
 
+    Args:
+        ancestor: its descendants belong to the run, too.
+
     Remembers whom it has seen, so that a process stays known whose environment can no longer be
     read because it is just ending.
     """
 
-    def __init__(self, run_id: str) -> None:
+    def __init__(self, run_id: str, ancestor: int = -1) -> None:
+        self._ancestor = ancestor
         self._mark = f"{RUN_ID}={run_id}".encode()
         self._sessions: dict[int, int] = {}
         self._known: dict[int, int] = {}
@@ -72,7 +76,7 @@ class RunProcesses:
         return found
 
     def _is_member(self, process: _Process, processes: dict[int, _Process]) -> bool:
-        if self._known.get(process.pid) == process.start:
+        if self._known.get(process.pid) == process.start or process.parent == self._ancestor:
             return True
         start = self._sessions.get(process.session)
         if start is not None and _is_same_leader(processes.get(process.session), start):

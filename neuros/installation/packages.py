@@ -201,7 +201,7 @@ class Installer:
             InstallationFailed: if uv fails, or is not there and cannot be installed.
             OSError: if it cannot be started, or the log cannot be written.
         """
-        uv, pip = self.require_uv(), [str(self.python), "-m", "pip", "config", "list"]
+        uv, pip = self.require_uv(), python_command("pip", "config", "list", python=self.python)
         listing = answer_of(pip, self.environ)
         settings, unknown = uv_settings(listing.stdout if listing else "", self.environ)
         if unknown:

@@ -230,12 +230,11 @@ class LoadMeter:
         """The load of each group that has a process now; :data:`LAUNCHER` always has."""
         found: dict[str, list[GroupLoad]] = {}
         for process, group in self._find():
-            load = _load_of(process)
+            load = _load_of(process, with_children=group != LAUNCHER)
             if load is not None:
                 found.setdefault(group, []).append(load)
-        # The launcher collects the nodes' processes: their time must not appear as its own.
-        times = self._launcher.cpu_times()
-        own = _load_of(self._launcher, cpu_s=times.user + times.system)
+        # The reaper collects the nodes' processes: their time must not appear as the launcher's.
+        own = _load_of(self._launcher, with_children=False)
         if own is not None:
             found.setdefault(LAUNCHER, []).append(own)
         return {
@@ -274,11 +273,11 @@ class LoadMeter:
             self._looks[process.pid] = self._looks.get(process.pid, 0) + 1
 
 
-def _load_of(process: psutil.Process, cpu_s: float | None = None) -> GroupLoad | None:
+def _load_of(process: psutil.Process, *, with_children: bool) -> GroupLoad | None:
     try:
         with process.oneshot():
-            if cpu_s is None:
-                cpu_s = sum(process.cpu_times()[:4])  # own and children's, user and system
+            # User and system, and then those of children that have ended.
+            cpu_s = sum(process.cpu_times()[: 4 if with_children else 2])
             memory_bytes, threads = process.memory_info().rss, process.num_threads()
     except psutil.Error:
         return None

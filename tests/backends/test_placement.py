@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,12 +15,12 @@ from hypothesis import strategies as st
 from neuros.backends.node_command import (
     THREAD_VARIABLES,
     NodeProcess,
-    children_on,
     place,
     thread_limits,
     usable_cores,
 )
 from neuros.backends.process_launchers import RunningProcess
+from neuros.backends.reaper import Reaper
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
 
@@ -44,33 +46,34 @@ def test_thread_pools_have_as_many_threads_as_the_node_asks_for_cores() -> None:
 
 
 # ------------------------------------------------------------------ processes
-def _mask_of(tmp_path: Path, cores: tuple[int, ...]) -> set[int]:
+@pytest.fixture
+def reaper() -> Iterator[Reaper]:
+    reaper = Reaper.start(secrets.token_hex(8))
+    yield reaper
+    reaper.finish()
+
+
+def _mask_of(tmp_path: Path, cores: tuple[int, ...], reaper: Reaper) -> set[int]:
     program = "import json, os; print(json.dumps(sorted(os.sched_getaffinity(0))))"
     log = tmp_path / "log"
     log.unlink(missing_ok=True)
     command = ["python3", "-S", "-c", program]
-    host = RunningProcess(NodeProcess(("a",), command, command, os.environ, log, tmp_path, cores))
+    process = NodeProcess(("a",), command, command, os.environ, log, tmp_path, cores)
+    host = RunningProcess(process, reaper)
     assert host.wait(10) == "exit code 0"
     return set(json.loads(log.read_text()))
 
 
-def test_a_process_has_its_cores_and_the_launcher_keeps_its_own(tmp_path: Path) -> None:
+def test_a_process_has_its_cores_and_the_next_one_all(tmp_path: Path, reaper: Reaper) -> None:
     before = usable_cores()
     for core in before:
-        assert _mask_of(tmp_path, (core,)) == {core}
-    assert _mask_of(tmp_path, ()) == before
+        assert _mask_of(tmp_path, (core,), reaper) == {core}
+    assert _mask_of(tmp_path, (), reaper) == before
     assert usable_cores() == before
 
 
-def test_a_core_that_is_not_there_is_a_fault_of_the_machine(tmp_path: Path) -> None:
+def test_a_core_that_is_not_there_is_a_fault_of_the_machine(tmp_path: Path, reaper: Reaper) -> None:
     before = usable_cores()
     with pytest.raises(EnvironmentFault, match="cannot start the process of a: "):
-        _mask_of(tmp_path, (max(before) + 1000,))
-    assert usable_cores() == before
-
-
-def test_cores_are_given_back_after_an_error() -> None:
-    before = usable_cores()
-    with pytest.raises(KeyError), children_on([min(before)]):
-        raise KeyError
-    assert usable_cores() == before
+        _mask_of(tmp_path, (max(before) + 1000,), reaper)
+    assert _mask_of(tmp_path, (), reaper) == before

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +16,7 @@ import pytest
 from neuros.backends import node_command
 from neuros.backends.node_command import process_environment
 from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher, RunningProcess
+from neuros.backends.reaper import Reaper
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.model import Folders, Node, NodeFile
@@ -35,7 +38,7 @@ class Run:
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "a run"
         self.folder.mkdir()
-        self.pids: list[int] = []
+        self.reaper = Reaper.start(secrets.token_hex(8))
         self.hosts: list[RunningProcess] = []
 
     def node(self, name: str, script: Path | None = None, **environment: str) -> NodeFile:
@@ -53,22 +56,13 @@ class Run:
         self, program: str, nodes: Sequence[NodeFile], in_process: bool = False
     ) -> list[RunningProcess]:
         kind = InProcessLauncher if in_process else ProcessLauncher
-        launcher = kind(NodeProgram(program=command(program), reaper=self))
+        launcher = kind(NodeProgram(program=command(program), reaper=self.reaper))
         self.hosts += launcher.start(nodes, {"NEUROS_RUN_ID": "1234", "SHARED": "run"})
         return self.hosts
 
     def end(self, program: str, nodes: Sequence[NodeFile], in_process: bool = False) -> list[str]:
         """Start and wait: how the hosts ended."""
         return [host.wait(10) or "" for host in self.start(program, nodes, in_process)]
-
-    def watch(self, pid: int) -> None:
-        self.pids.append(pid)
-
-    def remove_later(self, path: Path) -> None:
-        raise AssertionError(path)
-
-    def clean_with(self, module: str, argument: str) -> None:
-        raise AssertionError(module)
 
     def log(self, path: str) -> str:
         return (self.folder / path).read_text()
@@ -78,9 +72,7 @@ class Run:
 def run(tmp_path: Path) -> Iterator[Run]:
     run = Run(tmp_path)
     yield run
-    for host in run.hosts:
-        host.kill()
-        host.wait(10)
+    run.reaper.finish()
 
 
 def _wait_until(condition: Callable[[], bool], deadline_s: float = 10.0) -> None:
@@ -94,7 +86,6 @@ def test_one_process_per_node(run: Run) -> None:
     nodes = [run.node("snn"), run.node("robot")]
     assert run.end(SAY, nodes) == ["exit code 0"] * 2
     assert [host.names for host in run.hosts] == [("snn",), ("robot",)]
-    assert run.pids == [host.pid for host in run.hosts]
     said = json.loads(run.log("snn/node.log"))
     assert said["files"] == [str(run.folder / "snn/node.json")]
     assert said["folder"] == str(run.folder)
@@ -209,22 +200,37 @@ def _is_alive(pid: int) -> bool:
         return False
 
 
-def test_a_program_that_does_not_exist_is_a_fault_and_the_others_do_not_stay(run: Run) -> None:
-    class Failing(Run):
-        def watch(self, pid: int) -> None:
-            run.pids.append(pid)
-            if len(run.pids) == 2:
-                raise RuntimeError
+def _children_of(pid: int) -> list[int]:
+    return [int(text) for text in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
-    nowhere = NodeProgram(program=["/nowhere/python"])
-    with pytest.raises(EnvironmentFault, match="snn"):
-        ProcessLauncher(nowhere).start([run.node("snn")], {})
-    failing = Failing(run.folder)
-    with pytest.raises(RuntimeError):
-        ProcessLauncher(NodeProgram(program=command(SLEEP), reaper=failing)).start(
-            [run.node("a"), run.node("b")], {}
-        )
-    assert not any(map(_is_alive, run.pids))
+
+def test_a_program_that_does_not_exist_is_a_fault_and_the_others_do_not_stay(run: Run) -> None:
+    nowhere, here = Path("/nowhere/python"), Path(sys.executable)
+    program = NodeProgram(
+        program=command(SLEEP),
+        pythons={"a": here, "b": nowhere},
+        reaper=run.reaper,
+    )
+    with pytest.raises(EnvironmentFault, match=r"process of b: .*No such file.*/nowhere/python"):
+        ProcessLauncher(program).start([run.node("a"), run.node("b")], {})
+    assert not any(_is_alive(pid) for pid in _children_of(run.reaper.pid))
+
+
+def test_what_no_process_can_be_given_is_a_fault_and_the_next_one_starts(run: Run) -> None:
+    with pytest.raises(EnvironmentFault, match=r"process of snn: .*null"):
+        run.start(SLEEP, [run.node("snn", BAD="a\0b")])
+    assert run.end("pass", [run.node("robot")]) == ["exit code 0"]
+
+
+def test_how_a_process_ended_is_not_known_when_its_reaper_was_killed(run: Run) -> None:
+    (host,) = run.start(SLEEP, [run.node("snn")])
+    os.kill(run.reaper.pid, signal.SIGKILL)
+    _wait_until(lambda: not run.reaper.is_on_duty)
+    assert host.poll() is None
+    host.kill()
+    assert host.wait(10) == "how is not known, since the reaper was killed"
+    with pytest.raises(EnvironmentFault, match="process of robot: the reaper was killed"):
+        run.start(SLEEP, [run.node("robot")])
 
 
 def test_a_script_runs_first_in_the_environment_of_its_node(run: Run) -> None:
