@@ -227,6 +227,21 @@ def test_the_grace_period_ends_early_when_all_are_gone(reaper: Reaper) -> None:
     assert time.monotonic() - begin < 9
 
 
+def test_what_the_program_of_the_launcher_has_lost_is_left_alone(
+    reaper: Reaper, tmp_path: Path
+) -> None:
+    """It may be a program of the user: only what descends from a node belongs to the run."""
+    mark = tmp_path / "pid"
+    process = subprocess.Popen(["/bin/sh", "-c", f"sleep 60 & echo $! >{mark}"], env={})
+    process.wait(10)
+    stranger = int(mark.read_text())
+    try:
+        reaper.finish()
+        assert _is_alive(stranger)
+    finally:
+        os.kill(stranger, signal.SIGKILL)
+
+
 def test_processes_of_other_runs_are_left_alone(run_id: str, reaper: Reaper) -> None:
     other = _start(f"{run_id}0", "import time; print(flush=True); time.sleep(60)")
     try:
