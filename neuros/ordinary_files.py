@@ -11,6 +11,7 @@ import errno
 import io
 import math
 import os
+import pwd
 import stat
 import sys
 from collections.abc import Iterator
@@ -164,6 +165,22 @@ def reason_of(error: OSError) -> str:
     """What went wrong, and with which file if that is known."""
     reason = error.strerror or str(error)
     return f"{error.filename}: {reason}" if error.filename else reason
+
+
+def cannot_be_opened(error: OSError) -> str:
+    """One sentence about a file or folder; it names the folder that the user may not enter."""
+    file = os.path.abspath(os.fsdecode(error.filename))
+    text = f"{file} cannot be opened ({error.strerror})"
+    if error.errno != errno.EACCES:
+        return text
+    folders = [folder for folder in reversed(Path(file).parents) if os.path.isdir(folder)]
+    closed = next((folder for folder in folders if not os.access(folder, os.X_OK)), None)
+    place = closed or (file if os.path.lexists(file) else folders[-1])
+    what = "you may not enter" if closed else "you have no access to"
+    user = os.stat(place, follow_symlinks=False).st_uid
+    with contextlib.suppress(KeyError):
+        return f"{text}: {what} {place}, which belongs to {pwd.getpwuid(user).pw_name}"
+    return f"{text}: {what} {place}, which belongs to user {user}"
 
 
 def _is_ordinary(descriptor: int) -> bool:

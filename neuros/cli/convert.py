@@ -88,8 +88,10 @@ def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
         text = f"neuros convert needs MuJoCo: `pip install mujoco` ({error})"
         raise EnvironmentFault(text) from error
     named = Path(options.file)
-    if not os.path.exists(named):
-        raise UsageError(f"{named}: there is no such file")
+    try:
+        named.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        raise UsageError(f"{named}: there is no such file") from None
     try:
         source = model_file(named)
     except NotFound as error:

@@ -21,8 +21,12 @@ from neuros.cli import EXIT_CODES
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError, printable
 from neuros.options import positive_number
+from neuros.ordinary_files import cannot_be_opened
 from neuros.project.suggest import counted, did_you_mean, listed
 
+_NOT_OPENED = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP),
+)
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
 
@@ -221,9 +225,9 @@ def main(arguments: Sequence[str]) -> int:
             what = error.filename or "the output, or a file,"
             _complain(f"neuros: {what} could not be written ({error.strerror})")
             return EXIT_ENVIRONMENT
-        if error.errno not in (errno.ENAMETOOLONG, errno.ELOOP):
+        if error.errno not in _NOT_OPENED or error.filename is None:
             raise
-        _complain(f"neuros: {error.filename} cannot be opened ({error.strerror})")
+        _complain(f"neuros: {cannot_be_opened(error)}")
         return EXIT_USAGE
 
 
