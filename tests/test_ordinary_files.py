@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections.abc import Callable
@@ -10,7 +11,14 @@ from pathlib import Path
 import pytest
 
 from neuros.backends.node_command import last_line
-from neuros.ordinary_files import folder_in, open_log, open_new, open_ordinary, write_whole
+from neuros.ordinary_files import (
+    cannot_be_opened,
+    folder_in,
+    open_log,
+    open_new,
+    open_ordinary,
+    write_whole,
+)
 from neuros.recording.bag_files import BagWriter
 from neuros.recording.recorder import counts_of
 from neuros.recording.recording_plan import Stream, Topic
@@ -236,3 +244,15 @@ def test_nobody_waits_for_a_pipe_that_a_node_has_left(run: Path) -> None:
         SpoolReader(run).read(1)
     with pytest.raises(OSError, match="it is not an ordinary file"):
         counts_of(run)
+
+
+def test_who_has_no_access_learns_to_what_and_whose_it_is(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    owner = tmp_path.owner()
+    for path, named in ((file, file), (tmp_path / "new", tmp_path)):
+        error = PermissionError(errno.EACCES, "Permission denied", str(path))
+        assert cannot_be_opened(error) == (
+            f"{path} cannot be opened (Permission denied): you have no access to {named}, which"
+            f" belongs to {owner}"
+        )

@@ -280,9 +280,7 @@ def test_a_run_that_cannot_start_says_so(tmp_path: Path, monkeypatch: pytest.Mon
     def fail(*_: object) -> None:
         raise OSError("too many of them")
 
-    monkeypatch.setattr(
-        "neuros.backends.process_launchers.subprocess.Popen", _popen_but_not_for_hosts(fail)
-    )
+    monkeypatch.setattr("neuros.backends.reaper.Reaper.spawn", fail)
     with pytest.raises(EnvironmentFault, match="cannot start the process of thrower"):
         made.run(backend="in-process", output="run")
     assert neuros.Run("run").exit_code == 4
@@ -363,13 +361,3 @@ def _interrupted(program: str, number: int) -> tuple[str, int]:
                 os.kill(process.pid, number)
         killer.cancel()
     return "".join(lines), process.returncode
-
-
-def _popen_but_not_for_hosts(fail: Any) -> Any:
-    class Popen(subprocess.Popen):  # type: ignore[type-arg]
-        def __init__(self, arguments: Any, **options: Any) -> None:
-            if "node" in arguments:
-                fail()
-            super().__init__(arguments, **options)
-
-    return Popen

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import signal
-import subprocess
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from neuros.backends.node_command import node_process
 from neuros.errors import EnvironmentFault
 from neuros.options import Option
-from neuros.ports import BackEnd, Deployment, Finding, Launcher, NodeProgram, RunningNode
+from neuros.ports import (
+    BackEnd,
+    ChildProcess,
+    Deployment,
+    Finding,
+    Launcher,
+    NodeProgram,
+    RunningNode,
+)
 from neuros.project.model import Node, NodeFile, Project
 from neuros.stacks import ProcessThreads, threads_of
 
@@ -69,19 +75,14 @@ class NiceLauncher:
         started: list[NiceNode] = []
         for node in nodes:
             process = node_process(self._program, node, environment)
-            with open(process.log, "ab") as log:
-                child = subprocess.Popen(
-                    [*self._prefix, *process.command],
-                    env=process.environment,
-                    cwd=process.folder,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=log,
-                    start_new_session=True,
-                )
+            assert self._program.reaper is not None
+            child = self._program.reaper.spawn(
+                [*self._prefix, *process.command],
+                process.log,
+                process.folder,
+                process.environment,
+            )
             started.append(NiceNode(node.node.name, child))
-            if self._program.reaper:
-                self._program.reaper.watch(child.pid)
         return started
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
@@ -93,7 +94,7 @@ class NiceNode:
 
     is_abandoned = False
 
-    def __init__(self, name: str, child: subprocess.Popen[bytes]) -> None:
+    def __init__(self, name: str, child: ChildProcess) -> None:
         self.names = (name,)
         self._child = child
 
@@ -105,8 +106,7 @@ class NiceNode:
         return threads_of(self._child.pid)
 
     def kill(self) -> None:
-        if self._child.poll() is None:
-            os.killpg(self._child.pid, signal.SIGKILL)
+        self._child.send_signal(signal.SIGKILL, is_for_group=True)
 
 
 BACK_END = Nice()
