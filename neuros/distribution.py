@@ -28,8 +28,8 @@ WORKSPACE = (PACKAGE / "workspace").resolve()
 # With -m or -c, Python puts the current folder before all others on its path, and would import from
 # there what anybody has left. Its option -P is of Python 3.11, -I leaves out PYTHONPATH and the
 # user's packages, and PYTHONSAFEPATH would reach the programs that a plugin starts.
-_LEAVE_OUT_FOLDER = "import sys; sys.path[:1] == [''] and sys.path.pop(0)"
-_RUN_MODULE = "import runpy; runpy.run_module(sys.argv.pop(1), None, '__main__', True)"
+_LEAVE_OUT_FOLDER = 'import sys; sys.path[:1] == [""] and sys.path.pop(0)'
+_RUN_MODULE = 'import runpy; runpy.run_module(sys.argv.pop(1), None, "__main__", True)'
 
 
 def python_command(

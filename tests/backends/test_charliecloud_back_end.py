@@ -52,7 +52,8 @@ def test_each_node_runs_in_its_image_and_sees_the_folders_of_the_run_under_their
     command = line.partition(": ")[2].split(" (log: ")[0]
     assert f"--bind={CLOCK}:{CLOCK} " in command
     assert f"--bind={PACKAGE}:/neuros/lib/neuros " in command
-    assert f" {image} -- /opt/neuros/bin/python -m neuros.cli node " in command
+    assert f" {image} -- /opt/neuros/bin/python -c " in command
+    assert " neuros.cli node " in command
     assert (image / "neuros/lib/neuros").is_dir()
     assert (image / CLOCK.relative_to("/")).is_dir()
 

@@ -350,6 +350,7 @@ def test_a_dry_run_shows_the_python_of_each_node_and_makes_nothing(project: Proj
     assert container.startswith("container other: Python {}.{}, an envi".format(*HERE))
     folder = container.rpartition(" ")[2]
     assert last.startswith("process last")
-    assert f": {folder}/bin/python -m neuros.cli node " in last
-    assert f": {sys.executable} -m neuros.cli node " in first
+    assert f": {folder}/bin/python -c " in last
+    assert f": {sys.executable} -c " in first
+    assert all(" neuros.cli node " in each for each in (last, first))
     assert not project.cache.exists()
