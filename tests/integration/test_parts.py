@@ -103,6 +103,6 @@ def test_a_part_that_is_alone_is_ended_by_ctrl_c_as_ever(parts: Parts) -> None:
 
 
 def children(parent: int, argument: str) -> list[psutil.Process]:
-    """The child processes of a launcher that were given this argument."""
-    found = psutil.Process(parent).children()
+    """The processes below a launcher that were given this argument."""
+    found = psutil.Process(parent).children(recursive=True)
     return [child for child in found if any(argument in each for each in child.cmdline())]
