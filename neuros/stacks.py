@@ -128,11 +128,13 @@ def threads_of(pid: int) -> ProcessThreads:
 def allow_reading() -> None:
     """Let :func:`threads_of` read this process where Yama would allow it to ancestors only.
 
-    Then the process that has started this one may, and its children; in a container, where that is
-    not to be seen, any process of the same user.
+    Then the launcher may, and its children; it has started the reaper, which has started this
+    process. In a container, where that is not to be seen, any process of the same user may.
     """
-    parent = os.getppid()
-    reader = parent if parent > _INIT else _ANY
+    reader = _ANY
+    with contextlib.suppress(OSError), open(f"/proc/{os.getppid()}/stat", "rb") as file:
+        launcher = int(file.read().rpartition(b") ")[2].split()[1])
+        reader = launcher if launcher > _INIT else _ANY
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_PTRACER, ctypes.c_ulong(reader), 0, 0, 0)
 
