@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,7 @@ class Packets:
         received: the digest of each that arrived, (received,).
         taken: of each that a hook started on, its place among those that arrived, from 1, (taken,).
         taken_ns: when that was, (taken,).
+        pauses_ns: when the receiver stood still, start and end of each pause, (pauses, 2).
         damaged: files of which the rest is left out, from an entry that no node has written.
         sent_before, received_before, taken_before: how many entries the node has not kept, which
             came before the first ones here.
@@ -49,6 +50,7 @@ class Packets:
     received: Numbers
     taken: Numbers
     taken_ns: Numbers
+    pauses_ns: Numbers = field(default_factory=lambda: np.empty((0, 2), np.int64))
     damaged: tuple[Path, ...] = ()
     sent_before: int = 0
     received_before: int = 0
@@ -92,12 +94,20 @@ class Packets:
         return np.column_stack([sent_ns[places[is_known] - before - 1], taken_ns[is_known]])
 
     def latencies_ns(self, *, may_lose: bool) -> Numbers | None:
-        """Nanoseconds from when a packet was sent to each start of a hook on it.
+        """Nanoseconds from when a packet was sent to each start of a hook on it, without pauses.
 
         ``None`` as from :meth:`flights_ns`.
         """
         flights_ns = self.flights_ns(may_lose=may_lose)
-        return None if flights_ns is None else flights_ns[:, 1] - flights_ns[:, 0]
+        if flights_ns is None:
+            return None
+        latencies_ns: Numbers = np.diff(flights_ns).ravel()
+        if len(self.pauses_ns):
+            edges = self.pauses_ns.ravel()
+            paused_ns = np.repeat(np.cumsum(np.diff(self.pauses_ns).ravel()), 2)
+            paused_ns[::2] -= np.diff(self.pauses_ns).ravel()  # up to the start of each pause
+            latencies_ns = latencies_ns - np.diff(np.interp(flights_ns, edges, paused_ns)).ravel()
+        return latencies_ns
 
     def _which_arrived(self) -> Numbers | None:
         """For each packet that arrived, its place among those that were sent, from 0.
@@ -142,6 +152,7 @@ def read_packets(run_folder: Path, connection: Connection) -> Packets:
         received=received,
         taken=taken[:good],
         taken_ns=taken_ns[:good],
+        pauses_ns=_numbers(receiver / "pauses", np.int64, 2),
         damaged=damaged,
         sent_before=sent_before,
         received_before=received_before,

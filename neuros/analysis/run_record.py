@@ -278,8 +278,10 @@ class PastRun:
 
     def latencies_ns(self, connection: str) -> Numbers | None:
         """Nanoseconds from the sending of a packet to each start of a hook on it, if known."""
-        flights_ns = self.flights_ns(connection)
-        return None if flights_ns is None else flights_ns[:, 1] - flights_ns[:, 0]
+        from neuros.analysis.packets import may_have_lost
+
+        may_lose = may_have_lost(self.connections[connection])
+        return self.packets[connection].latencies_ns(may_lose=may_lose)
 
     @cached_property
     def traces(self) -> dict[str, Trace]:

@@ -93,12 +93,14 @@ class LiveCounters:
         sent_ns: by connection, the position of the last packet sent, and when the last few were.
         taken_ns: by connection, the position of the packet on which a hook has started last, and
             when that was.
+        paused_ns: start and end of the last times in which it stood still, since it was paused.
     """
 
     now_s: float
     metrics: Metrics
     sent_ns: Mapping[str, tuple[int, tuple[int, ...]]]
     taken_ns: Mapping[str, tuple[int, int]]
+    paused_ns: tuple[tuple[int, int], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -266,6 +266,11 @@ class Engine:
         return self._pause.is_on
 
     @property
+    def pauses(self) -> Pause:
+        """Its pause, with the times in which it stood still."""
+        return self._pause
+
+    @property
     def is_driving(self) -> bool:
         """Whether it has hooks that start unasked, and so keep a project going."""
         return any(map(drives, tuple(self.all_hooks)))
@@ -372,7 +377,7 @@ class Engine:
         if lifecycle.is_stopped:
             self._cause = self.rest()
         elif pause.is_on:
-            self._cause = pause.cause_of_rest(self._schedule.candidates)
+            self._cause = pause.cause_of_rest(self._schedule.candidates, self.since_ns)
         else:
             self._cause = self._schedule.cause_of_rest()
         if not lifecycle.is_active and self._cause is not SCHEDULING and not self._to_itself:
@@ -394,7 +399,7 @@ class Engine:
         self._schedule.move_to_end(hook)
         start_ns = self._clock()
         if self._pause.is_on:
-            self._pause.note_start(hook)
+            self._pause.note_start(hook, start_ns)
         elif hook.ticks is not None:
             hook.ticks.note(start_ns)
             hook.set_due(self._lifecycle.tick_start_ns, start_ns)

@@ -14,6 +14,7 @@ a pause lets them start in steps only.
 from __future__ import annotations
 
 from array import array
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
 from neuros.engine.hook import Hook, Source
@@ -24,6 +25,8 @@ from neuros.project.model import Connection
 
 _MANY = 2**62
 """More hooks and executions than there will be."""
+
+_LAST_STILL = 16
 
 MOST_EXECUTIONS = 10_000
 """240 kB, which are freed as soon as they are written."""
@@ -271,6 +274,9 @@ class Pause:
 
     Attributes:
         is_on: whether the node is paused.
+        still_ns: when the node stood still, and no hook of a step ran: start and end of each such
+            time, one after the other. No part of them belongs to the latency of a packet.
+        last_still_ns: the last few of them, also when they have been written out.
     """
 
     def __init__(
@@ -284,12 +290,16 @@ class Pause:
         self._granted = 0
         self._started: dict[Hook, int] = {}
         self._limits_all = False
+        self._still_since_ns: int | None = None
+        self.still_ns = array("q")
+        self.last_still_ns: deque[tuple[int, int]] = deque(maxlen=_LAST_STILL)
         self.is_on = False
 
     def begin(self, now_ns: int) -> None:
         """Pause; a second time takes back what is left of steps."""
         if not self.is_on:
             self.is_on, self._since_ns = True, now_ns
+            self._still_since_ns = now_ns
         self._granted = 0
         self._started.clear()
 
@@ -298,6 +308,7 @@ class Pause:
         if not self.is_on:
             return
         self.is_on = False
+        self._move(now_ns)
         if not self._lifecycle.is_running:
             return
         paused_ns = now_ns - max(self._since_ns, self._lifecycle.tick_start_ns)
@@ -327,13 +338,24 @@ class Pause:
             return self._started.get(hook, 0) < self._granted
         return self._granted > 0 and all(port.has_waited(self._arrived) for port in hook.inputs)
 
-    def cause_of_rest(self, candidates: Iterable[Hook]) -> Rest:
+    def cause_of_rest(self, candidates: Iterable[Hook], now_ns: int) -> Rest:
         """``PAUSED``, or ``SCHEDULING`` if a hook of a step is about to start."""
-        may_start = any(self.allows(hook) and hook.can_send() for hook in candidates)
-        return SCHEDULING if may_start else PAUSED
+        if any(self.allows(hook) and hook.can_send() for hook in candidates):
+            return SCHEDULING
+        if self._still_since_ns is None:
+            self._still_since_ns = now_ns
+        return PAUSED
 
-    def note_start(self, hook: Hook) -> None:
+    def _move(self, now_ns: int) -> None:
+        """The node stands still no longer."""
+        if self._still_since_ns is not None:
+            self.last_still_ns.append((self._still_since_ns, now_ns))
+            self.still_ns.extend((self._still_since_ns, now_ns))
+            self._still_since_ns = None
+
+    def note_start(self, hook: Hook, now_ns: int) -> None:
         """A hook starts while the node is paused."""
+        self._move(now_ns)
         started = self._started[hook] = self._started.get(hook, 0) + 1
         if drives(hook):
             self._arrived = self._arrivals()

@@ -213,9 +213,9 @@ class Shutdown:
         for text in self._finalising.remarks(now_s):
             self._output.log("INFO", text)
         running = [p for p in self._processes if not self._processes.killed.issuperset(p.names)]
-        left_s = {process: self._left_s(process, now_s) for process in running}
-        self._begin_to_read([process for process in running if left_s[process] < _READ_EARLY_S])
-        overdue = [process for process in running if left_s[process] <= 0.0]
+        left = [(process, self._left_s(process, now_s)) for process in running]
+        self._begin_to_read([process for process, left_s in left if left_s < _READ_EARLY_S])
+        overdue = [process for process, left_s in left if left_s <= 0.0]
         for process in overdue:
             self._fail_to_end(process, now_s)
         self.kill(overdue)

@@ -16,6 +16,9 @@ A list that has filled a quarter of its room goes on in another file, whose name
 number of entries before it, as ``3.sent_ns.524288``. With four files full, the oldest one goes. In
 a recorded run a list ends instead, since a replay begins at the start.
 
+``<node>/packets/pauses`` has when the node stood still, since the run was paused: start and end of
+each such time.
+
 ``<node>/packets/executions`` has the first executions of the node's hooks (the place of the hook in
 ``hooks.json``, start and end), ``credits`` the acknowledgements that arrived meanwhile (index of
 the connection, position, time): three 8-byte numbers each.
@@ -152,6 +155,7 @@ class PacketLog:
             name = f"{key.index}." if isinstance(key, Connection) else ""
             yield name and f"{name}taken", subscription.taken
             yield name and f"{name}taken_ns", subscription.taken_ns
+        yield "pauses", self._engine.pauses.still_ns
         yield "executions", self._engine.execution_log.executions
         yield "credits", self._engine.execution_log.credits
         if isinstance(self._engine, LoggedEngine):

@@ -188,6 +188,7 @@ def live_counters(engine: Engine, now_ns: int) -> LiveCounters:
         cast(Metrics, metrics),
         steadily(lambda: _sent(engine), no_sent),
         steadily(lambda: _taken(engine), no_taken),
+        steadily(lambda: tuple(engine.pauses.last_still_ns), ()),
     )
 
 

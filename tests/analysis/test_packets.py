@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,12 @@ def latencies_ms(found: Packets, *, may_lose: bool) -> list[float] | None:
 def test_where_nothing_is_lost_the_place_says_which_packet_it_is() -> None:
     found = packets([10, 20, 30], taken=[1, 2, 3], taken_ms=[11, 25, 37])
     assert latencies_ms(found, may_lose=False) == [1, 5, 7]
+
+
+def test_the_time_of_a_pause_is_no_latency() -> None:
+    found = packets([10, 20, 30, 90], taken=[1, 2, 3, 4], taken_ms=[11, 65, 66, 91])
+    pauses = np.array([[22, 42], [43, 63]], np.int64) * MS
+    assert latencies_ms(replace(found, pauses_ns=pauses), may_lose=False) == [1, 5, 4, 1]
 
 
 def test_a_packet_that_was_skipped_has_no_latency() -> None:

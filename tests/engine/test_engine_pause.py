@@ -27,6 +27,23 @@ def test_a_paused_node_starts_no_hook_and_forgets_no_packet():
     assert bench.ran == ["f", "f"]
 
 
+def test_it_notes_when_it_stood_still_and_not_while_hooks_of_steps_ran():
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0, queue_size=2)])
+    bench.hook_s = 1.0
+    start_ns = bench.clock.now_ns
+    bench.engine.pause()
+    bench.packet(IN)
+    bench.pass_time(3.0)
+    bench.engine.step(1, is_driven=False)
+    bench.pass_time(4.0)
+    bench.engine.pause()
+    bench.pass_time(1.0)
+    bench.engine.resume()
+    bench.packet(IN)
+    still_s = [(each - start_ns) / SECOND for each in bench.engine.pauses.still_ns]
+    assert still_s == [0.0, 3.0, 4.0, 9.0]
+
+
 def test_a_paused_node_asks_for_no_further_pass():
     bench = Bench(function("f", "x"), connections=[wire(IN, 0)])
     bench.engine.pause()

@@ -63,7 +63,7 @@ class Speaker:
 
     def __init__(self, program: RosProgram, live: LiveRun) -> None:
         self._publisher = program.node.create_publisher(message_class(STRING), "/said", 10)
-        self._link = _observing(live)
+        self._link = observing(live)
         self.beats = self.heard = self.arrived = 0
         self.is_paused = False
 
@@ -95,7 +95,8 @@ class Speaker:
                         self.is_paused = metrics["state"]["state"] == "paused"
 
 
-def _observing(live: LiveRun) -> ControlLink:
+def observing(live: LiveRun) -> ControlLink:
+    """An observer of a run, as soon as that lets it in."""
     while True:
         with contextlib.suppress(OSError):
             link = ControlLink(connect(live.control_address), TO_OBSERVERS, "the supervisor")

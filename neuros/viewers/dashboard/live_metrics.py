@@ -12,7 +12,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Mapping, Sequence
 from statistics import fmean
-from typing import Any
+from typing import Any, TypeAlias
 
 from neuros.control import (
     WORLD,
@@ -47,6 +47,10 @@ _PATIENCE_S = 1.0
 _GEOMETRY_S = 20.0
 
 
+Pauses: TypeAlias = Sequence[tuple[int, int]]
+"""Start and end of times in which a node stood still, in nanoseconds."""
+
+
 class Latency:
     """Latency of one connection: from the sending of a packet to the start of a hook on it.
 
@@ -56,7 +60,7 @@ class Latency:
 
     def __init__(self) -> None:
         self._sent_ns: OrderedDict[int, int] = OrderedDict()
-        self._taken: deque[tuple[int, int]] = deque(maxlen=_MOST_TAKEN)
+        self._taken: deque[tuple[int, int, Pauses]] = deque(maxlen=_MOST_TAKEN)
         self._last_ms: deque[float] = deque(maxlen=5)
 
     def sent(self, last: int, times_ns: Sequence[int]) -> None:
@@ -67,10 +71,10 @@ class Latency:
             self._sent_ns.popitem(last=False)
         self._match()
 
-    def taken(self, position: int, time_ns: int) -> None:
-        """A hook has started on a packet."""
+    def taken(self, position: int, time_ns: int, paused_ns: Pauses = ()) -> None:
+        """A hook has started on a packet; its node stood still at times that do not count."""
         if not self._taken or self._taken[-1][0] != position:
-            self._taken.append((position, time_ns))
+            self._taken.append((position, time_ns, paused_ns))
             self._match()
 
     @property
@@ -79,11 +83,16 @@ class Latency:
         return fmean(self._last_ms) if self._last_ms else None
 
     def _match(self) -> None:
-        for position, time_ns in tuple(self._taken):
+        for taken in tuple(self._taken):
+            position, time_ns, paused_ns = taken
             sent_ns = self._sent_ns.get(position)
             if sent_ns is not None:
-                self._taken.remove((position, time_ns))
-                self._last_ms.append(max(0, time_ns - sent_ns) / 1e6)
+                self._taken.remove(taken)
+                still_ns = sum(
+                    max(0, min(end_ns, time_ns) - max(start_ns, sent_ns))
+                    for start_ns, end_ns in paused_ns
+                )
+                self._last_ms.append(max(0, time_ns - sent_ns - still_ns) / 1e6)
 
 
 class Speed:
@@ -200,7 +209,7 @@ class LiveMetrics:
         for name, (last, times_ns) in counters.sent_ns.items():
             self._latencies.setdefault(name, Latency()).sent(last, times_ns)
         for name, (position, time_ns) in counters.taken_ns.items():
-            self._latencies.setdefault(name, Latency()).taken(position, time_ns)
+            self._latencies.setdefault(name, Latency()).taken(position, time_ns, counters.paused_ns)
         for name, latency in self._latencies.items():
             self.connections[name]["latency_ms"] = latency.ms
 

@@ -23,7 +23,7 @@ def node_status(node: str, now_s: float, **shown: Any) -> NodeStatus:
         "outgoing": shown.get("outgoing", {}),
         "incoming": shown.get("incoming", {}),
     }
-    times = shown.get("sent_ns", {}), shown.get("taken_ns", {})
+    times = shown.get("sent_ns", {}), shown.get("taken_ns", {}), shown.get("paused_ns", ())
     return NodeStatus(node, 1, shown.get("sim_time"), LiveCounters(now_s, metrics, *times))
 
 
@@ -77,6 +77,15 @@ def test_latency_is_told_by_the_positions_of_packets_whoever_shows_itself_first(
             figures.take(each)
         figures.take(statuses[0])
         assert figures.connections[LINK]["latency_ms"] == pytest.approx(0.5)
+
+
+def test_the_time_of_a_pause_is_no_latency() -> None:
+    figures = LiveMetrics()
+    figures.take(node_status("a", 1.0, outgoing=outgoing(1), sent_ns={LINK: (1, (1_000_000,))}))
+    taken = {LINK: (1, 90_000_000)}
+    paused = ((0, 500_000), (2_000_000, 89_500_000))
+    figures.take(node_status("b", 1.0, incoming=incoming(1), taken_ns=taken, paused_ns=paused))
+    assert figures.connections[LINK]["latency_ms"] == pytest.approx(1.5)
 
 
 def test_shares_are_seconds_of_each_state_per_second() -> None:
