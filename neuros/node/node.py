@@ -341,6 +341,8 @@ class NodeRuntime:
 
     def _load_plugin(self) -> None:
         node = self.file.node
+        for port in (*node.inputs, *node.outputs):  # the plugin may make messages when imported
+            self._middleware.packets.message_class(port.type)
         self.specs = self._plugin = with_clocks(
             node, load_plugin(node.plugin, self.name, node.module)
         )

@@ -28,6 +28,7 @@ from neuros.project.model import Port
 from neuros.transport.codecs import message_codec
 from neuros.transport.imports_when_used import imports_when_used
 from neuros.transport.schema import Field, Shape, Sort, schema
+from neuros.transport.setters import guard_setters
 from neuros.transport.values import checker
 
 _TYPE_NAME = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/msg/([A-Za-z][A-Za-z0-9_]*)")
@@ -52,6 +53,7 @@ def message_class(type_name: str) -> type:
             # What ROS loads for its first message uses a module that Python calls deprecated.
             warnings.simplefilter("ignore", DeprecationWarning)
             check_for_type_support(found)
+        guard_setters(found)
     except (ImportError, AttributeError, ValueError) as error:
         raise EnvironmentFault(
             f"message type {type_name} cannot be imported here ({error}): is its package"

@@ -58,20 +58,20 @@ def checker(kind: Any) -> Check:
             return message
         try:
             return convert(message)
-        except _Mismatch as wrong:
+        except Mismatch as wrong:
             raise WrongValue(wrong.path, wrong.found, wrong.allowed) from None
 
     return check
 
 
-class _Mismatch(Exception):
+class Mismatch(Exception):
     """A wrong value, with the steps that lead to it from where it has come to so far."""
 
     def __init__(self, found: str, allowed: str, path: str = "") -> None:
         super().__init__()
         self.found, self.allowed, self.path = found, allowed, path
 
-    def within(self, step: str) -> _Mismatch:
+    def within(self, step: str) -> Mismatch:
         """This error, seen from one step further out."""
         is_first = not self.path or self.path.startswith("[")
         self.path = step + self.path if is_first else f"{step}.{self.path}"
@@ -282,13 +282,13 @@ def _convert_message(kind: Any) -> Convert:
     def convert(message: Any) -> Any:
         if type(message) is not kind:
             if not isinstance(message, kind):
-                raise _Mismatch(_describe(message), layout.name)
+                raise Mismatch(_describe(message), layout.name)
             message = _of_very_class(message, kind)
         for slot, convert_field in fields:
             value = getattr(message, slot, _NOTHING)
             try:
                 converted = convert_field(value)
-            except _Mismatch as wrong:
+            except Mismatch as wrong:
                 raise wrong.within(slot[1:]) from None
             if converted is not value:
                 setattr(message, slot, converted)
@@ -312,13 +312,13 @@ def _of_very_class(message: Any, kind: Any) -> Any:
 
 def _convert_field(field: Field) -> Convert:
     if field.shape is Shape.SINGLE:
-        return _convert_single(field.type)
+        return single_converter(field.type)
     if field.shape is Shape.LIST:
         return _convert_list(field)
-    return _convert_buffer(field) if field.shape is Shape.BUFFER else _convert_array(field)
+    return buffer_converter(field) if field.shape is Shape.BUFFER else _convert_array(field)
 
 
-def _convert_single(of: Type) -> Convert:
+def single_converter(of: Type) -> Convert:
     if of.sort is Sort.MESSAGE:
         return _convert_message(of.message)
     if of.sort is Sort.INTEGER:
@@ -338,10 +338,10 @@ def _convert_integer(of: Type) -> Convert:
         number = value if type(value) is int else _number(value, text)
         if type(number) is float:
             if not number.is_integer():
-                raise _Mismatch(_describe(value), f"{text} without a fraction")
+                raise Mismatch(_describe(value), f"{text} without a fraction")
             number = int(number)
         if number not in allowed:
-            raise _Mismatch(_describe(value), text)
+            raise Mismatch(_describe(value), text)
         return int(number)
 
     return convert
@@ -359,7 +359,7 @@ def _convert_float(of: Type) -> Convert:
                 return float(number)
             rounded: float = _FLOAT.unpack(_FLOAT.pack(float(number)))[0]
         except OverflowError:
-            raise _Mismatch(_describe(value), limits) from None
+            raise Mismatch(_describe(value), limits) from None
         return rounded
 
     return convert
@@ -384,16 +384,16 @@ def _number(value: Any, allowed: str) -> int | float:
         return int(value)
     elif isinstance(value, numbers.Real):
         return float(value)
-    raise _Mismatch(_describe(value), allowed)
+    raise Mismatch(_describe(value), allowed)
 
 
 def _as_array(value: Any, allowed: str) -> Any:
     try:
         found = numpy.asarray(value)
     except Exception:  # an array of another library, which has its reasons
-        raise _Mismatch(_describe(value), allowed) from None
+        raise Mismatch(_describe(value), allowed) from None
     if isinstance(value, numpy.ma.MaskedArray) and numpy.ma.is_masked(value):
-        raise _Mismatch(_describe(value), allowed)
+        raise Mismatch(_describe(value), allowed)
     return found
 
 
@@ -402,15 +402,15 @@ def _convert_text(of: Type) -> Convert:
 
     def convert(value: Any) -> str:
         if not isinstance(value, str):
-            raise _Mismatch(_describe(value), of.name)
+            raise Mismatch(_describe(value), of.name)
         text = str.__str__(value)
         if is_exact(text):
             return text
         if of.bound is not None and len(text) > of.bound:
             allowed = f"{of.name}: at most {of.bound} characters"
-            raise _Mismatch(f"{_REPR.repr(text)}: {len(text)} characters", allowed)
+            raise Mismatch(f"{_REPR.repr(text)}: {len(text)} characters", allowed)
         reason = "without NUL" if "\0" in text else "without halves of surrogate pairs"
-        raise _Mismatch(_describe(value), f"{of.name} {reason}")
+        raise Mismatch(_describe(value), f"{of.name} {reason}")
 
     return convert
 
@@ -422,7 +422,7 @@ def _to_bool(value: Any) -> bool:
         found = _as_array(value, "bool: True or False")
         if found.dtype.kind == "b":
             return bool(found.reshape(-1)[0])
-    raise _Mismatch(_describe(value), "bool: True or False")
+    raise Mismatch(_describe(value), "bool: True or False")
 
 
 def _to_byte(value: Any) -> bytes:
@@ -430,17 +430,17 @@ def _to_byte(value: Any) -> bytes:
         held = bytes(value)
         if len(held) == 1:
             return value if type(value) is bytes else held
-    raise _Mismatch(_describe(value), "byte: bytes of length 1")
+    raise Mismatch(_describe(value), "byte: bytes of length 1")
 
 
 def _to_character(value: Any) -> str:
     if isinstance(value, str) and _is_character(text := str.__str__(value)):
         return text
-    raise _Mismatch(_describe(value), "char: one character of ASCII")
+    raise Mismatch(_describe(value), "char: one character of ASCII")
 
 
 def _convert_list(field: Field) -> Convert:
-    convert_item = _convert_single(field.type)
+    convert_item = single_converter(field.type)
 
     def convert(value: Any) -> list[Any]:
         items = _list_of(value, field)
@@ -461,7 +461,7 @@ def _convert_items(items: Sequence[Any], convert_item: Convert) -> list[Any]:
     try:
         for item in items:
             converted.append(convert_item(item))
-    except _Mismatch as wrong:
+    except Mismatch as wrong:
         raise wrong.within(f"[{len(converted)}]") from None
     return converted
 
@@ -482,24 +482,24 @@ def _list_of(value: Any, field: Field) -> list[Any]:
     return list(value)
 
 
-def _no_list(value: Any, field: Field) -> _Mismatch:
-    return _Mismatch(_describe(value), f"{field.name}: a list, a tuple or an array")
+def _no_list(value: Any, field: Field) -> Mismatch:
+    return Mismatch(_describe(value), f"{field.name}: a list, a tuple or an array")
 
 
 def _check_length(length: int, field: Field) -> None:
     if field.size is not None and length != field.size:
-        raise _Mismatch(_items(length), f"{field.name}: exactly {_items(field.size)}")
+        raise Mismatch(_items(length), f"{field.name}: exactly {_items(field.size)}")
     if field.bound is not None and length > field.bound:
-        raise _Mismatch(_items(length), f"{field.name}: at most {_items(field.bound)}")
+        raise Mismatch(_items(length), f"{field.name}: at most {_items(field.bound)}")
 
 
 def _items(number: int) -> str:
     return f"{number} item{'' if number == 1 else 's'}"
 
 
-def _convert_buffer(field: Field) -> Convert:
+def buffer_converter(field: Field) -> Convert:
     code = field.type.code
-    to_numbers = _to_numbers(field)
+    to_numbers = numbers_converter(field)
 
     def convert(value: Any) -> array[Any]:
         if type(value) is array and value.typecode == code:
@@ -516,7 +516,7 @@ def _convert_buffer(field: Field) -> Convert:
 
 def _convert_array(field: Field) -> Convert:
     dtype, shape = numpy.dtype(field.type.code), (field.size,)
-    to_numbers = _to_numbers(field)
+    to_numbers = numbers_converter(field)
 
     def convert(value: Any) -> Any:
         if type(value) is numpy.ndarray and value.dtype == dtype and value.shape == shape:
@@ -529,10 +529,10 @@ def _convert_array(field: Field) -> Convert:
     return convert
 
 
-def _to_numbers(field: Field) -> Convert:
+def numbers_converter(field: Field) -> Convert:
     """A function that makes an array of NumPy of the field's type from many numbers."""
     of, dtype = field.type, numpy.dtype(field.type.code)
-    convert_item = _convert_single(of)
+    convert_item = single_converter(of)
 
     def convert(value: Any) -> Any:
         if isinstance(value, bytes | bytearray) and of.code == "B":
@@ -568,8 +568,8 @@ def _cast(found: Any, of: Type, dtype: Any) -> Any:
     if is_wrong.any():
         place = int(numpy.argmax(is_wrong.reshape(-1)))
         try:
-            _convert_single(of)(found.reshape(-1)[place])
-        except _Mismatch as wrong:
+            single_converter(of)(found.reshape(-1)[place])
+        except Mismatch as wrong:
             raise wrong.within(f"[{place}]") from None
     return made
 

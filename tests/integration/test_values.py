@@ -85,6 +85,13 @@ class TestWhatFits:
         poses = (finished.run_folder / "book/poses").read_text()
         assert poses.count("geometry_msgs.msg.Pose(") == 4
         assert "x=0.0, y=7.0, z=0.0" in poses
+        levels = (finished.run_folder / "book/levels").read_text()
+        assert f"data=[1.0, {float(numpy.float32(0.1))}, inf]" in levels
+        odometry = (finished.run_folder / "book/odometry").read_text()
+        ones = [float(row == column) for row in range(6) for column in range(6)]
+        ones[7] = 0.5
+        numbers = re.findall(r"covariance=array\(\[([^]]*)\]\)", odometry)
+        assert [float(number) for number in numbers[0].split(",")] == ones
 
     def test_it_is_recorded_as_it_arrives(self, finished: Finished) -> None:
         assert finished.run_folder is not None
@@ -115,9 +122,18 @@ REFUSED = {
     "range": "packet for output 'count': field 'data' must be uint8: 0 to 255, but is 300 (int)",
     "nested": "packet for output 'poses': field 'poses[3].position.y' must be float64,"
     " but is 'up' (str)",
+    "fixed": "WrongValue: field 'covariance[0]' must be float64, but is '12' (str)",
+    "element": "WrongValue: field 'covariance' must be float64, but is None (NoneType)",
+    "large": "WrongValue: field 'data[1]' must be float32: -3.4028235e+38 to 3.4028235e+38,"
+    " but is 1e+39 (float)",
+    "made": "WrongValue: field 'data[1]' must be float32: -3.4028235e+38 to 3.4028235e+38,"
+    " but is 1e+39 (numpy.float64)",
     "external": "packet for output 'said': field 'data' must be float64, but is 'loud' (str)",
 }
-RUNS = [*itertools.product(BACKENDS, REFUSED), ("docker", "nested")]  # of containers, one
+RUNS = [
+    *itertools.product(BACKENDS, REFUSED),
+    *(("docker", wrong) for wrong in ("nested", "element")),
+]
 
 
 @pytest.mark.parametrize(("where", "wrong"), RUNS)

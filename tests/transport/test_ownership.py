@@ -63,7 +63,7 @@ def handed_over(box: list[Any]) -> list[Any]:
 def parts(value: Any) -> list[Any]:
     """Everything of a packet that can change, the packet itself included."""
     if hasattr(value, "get_fields_and_field_types"):
-        fields = [getattr(value, name) for name in value.get_fields_and_field_types()]
+        fields = [getattr(value, f"_{name}") for name in value.get_fields_and_field_types()]
         return [value, *(part for field in fields for part in parts(field))]
     if isinstance(value, list):
         return [value, *(part for item in value for part in parts(item))]
@@ -143,7 +143,7 @@ def test_an_array_that_shows_the_memory_of_another_is_not_handed_over() -> None:
 
 def test_an_array_that_cannot_be_written_to_is_not_handed_over() -> None:
     packet = Imu()
-    packet.orientation_covariance.flags.writeable = False
+    packet._orientation_covariance.flags.writeable = False
     assert not unshared_check(type(packet))(packet)
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import enum
 import fractions
+import pickle
+import re
 import struct
 from array import array
 from collections.abc import Callable
@@ -16,10 +19,24 @@ from geometry_msgs.msg import Pose, PoseArray, PoseStamped, Twist, TwistStamped,
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from message_values import is_empty, message_classes, parts, right_messages, wrong_messages
+from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import CameraInfo, Imu, JointState, LaserScan
 from shape_msgs.msg import SolidPrimitive
-from std_msgs.msg import Bool, Byte, Float32, Float64, Header, Int32, String, UInt8, UInt64
+from std_msgs.msg import (
+    Bool,
+    Byte,
+    Float32,
+    Float32MultiArray,
+    Float64,
+    Float64MultiArray,
+    Header,
+    Int32,
+    String,
+    UInt8,
+    UInt64,
+)
+from unique_identifier_msgs.msg import UUID
 
 from neuros.errors import WrongValue
 from neuros.transport.codecs import message_codec
@@ -244,6 +261,137 @@ class TestSequences:
         assert refusal(scan).path == "ranges[1]"
         scan._ranges = array("d", [0.1])
         assert parts(checked(scan).ranges) == parts(array("f", [0.1]))
+
+
+def with_ranges(values: Any) -> Any:
+    scan = LaserScan()
+    scan.ranges = values
+    return scan
+
+
+class TestArraysThatSettersMake:
+    """Those of ROS would change these values before a packet is checked."""
+
+    @pytest.mark.parametrize(
+        ("values", "text"),
+        [
+            ([300] * 16, "[0]' must be uint8: 0 to 255, but is 300 (int)"),
+            ([numpy.int64(300)] * 16, "[0]' must be uint8: 0 to 255, but is 300 (numpy.int64)"),
+            (numpy.full(16, 300), "[0]' must be uint8: 0 to 255, but is 300 (numpy.int64)"),
+            ([[0] * 3, [1, -1, 1]], "[1]' must be uint8: 0 to 255, but is -1 (int)"),
+            ([0, 1.5], "[1]' must be uint8: 0 to 255 without a fraction, but is 1.5 (float)"),
+            ([0, "12"], "[1]' must be uint8: 0 to 255, but is '12' (str)"),
+            (numpy.array(["12"]), "[0]' must be uint8: 0 to 255, but is '12' (numpy.str_)"),
+            ("12", "' must be uint8[16]: a list, a tuple or an array, but is '12' (str)"),
+        ],
+    )
+    def test_a_fixed_number_of_integers_is_not_cut_off(self, values: Any, text: str) -> None:
+        for make in (lambda: UUID(uuid=values), lambda: setattr(UUID(), "uuid", values)):
+            with pytest.raises(WrongValue, match=re.escape(f"field 'uuid{text}")):
+                make()
+
+    @pytest.mark.parametrize("value", ["12", None, 1j, numpy.complex128(1), 10**400])
+    def test_a_fixed_number_of_floats_takes_real_numbers_alone(self, value: Any) -> None:
+        with pytest.raises(
+            WrongValue, match=r"field 'orientation_covariance\[8\]' must be float64"
+        ):
+            Imu(orientation_covariance=[*[0.5] * 8, value])
+
+    @pytest.mark.parametrize(
+        "values",
+        [
+            [0.5, 1e39],
+            (0.5, 1e39),
+            [1, 10**39],
+            [0.5, numpy.float64(1e39)],
+            numpy.array([0.5, 1e39]),
+            array("d", [0.5, 1e39]),
+            (value for value in (0.5, 1e39)),
+            [float("inf"), -1e39],
+        ],
+    )
+    def test_no_float32_becomes_infinite(self, values: Any) -> None:
+        values = values if hasattr(values, "__len__") else [*values]
+        for make in (with_ranges, lambda values: LaserScan(ranges=values)):
+            with pytest.raises(WrongValue, match=r"field 'ranges\[1\]' must be float32"):
+                make(values)
+
+    @pytest.mark.parametrize("values", [["1"], [None], [1j], [numpy.complex128(1)], "1", 5])
+    def test_what_is_no_real_number_is_refused_in_sequences(self, values: Any) -> None:
+        for kind in (Float32MultiArray, Float64MultiArray):
+            with pytest.raises(WrongValue, match=r"field 'data(\[0\])?' must be float"):
+                kind(data=values)
+
+    @pytest.mark.parametrize(
+        "values",
+        [
+            [0.5, 2],
+            (0.5, 2),
+            {0.5: "a", 2: "b"}.keys(),
+            iter([0.5, 2.0]),
+            numpy.array([0.5, 2]),
+            array("d", [0.5, 2]),
+            array("f", [0.5, 2]),
+            array("f", [0.5, 2]).tobytes(),
+            [numpy.float32(0.5), numpy.array([2])],
+        ],
+    )
+    def test_what_fits_becomes_what_ros_makes_of_it(self, values: Any) -> None:
+        assert parts(with_ranges(values).ranges) == parts(array("f", [0.5, 2]))
+
+    def test_infinite_values_stay_infinite(self) -> None:
+        ends = [float("inf"), -float("inf"), 1.0]
+        assert with_ranges(ends).ranges.tolist() == ends
+        assert with_ranges(numpy.array(ends)).ranges.tolist() == ends
+
+    def test_what_is_assigned_is_copied_and_a_matrix_keeps_its_shape(self) -> None:
+        given = numpy.eye(3)
+        camera = CameraInfo(k=given)
+        given[0, 0] = 5.0
+        assert camera.k[0, 0] == 1.0
+        camera.k = [[1, 2, 3], [4, 5, 6], [7, 8, 9]]
+        assert camera.k[2, 0] == 7.0
+        assert checked(camera).k.tolist() == [1, 2, 3, 4, 5, 6, 7, 8, 9]
+
+    @pytest.mark.parametrize("value", [300, -1, numpy.int64(300), 1.5, "12", None, [0, 300]])
+    def test_an_element_of_a_fixed_number_of_them_is_refused_too(self, value: Any) -> None:
+        uuid = UUID()
+        place = slice(0, 2) if isinstance(value, list) else 3
+        for numbers in (uuid.uuid, uuid.uuid[:8], uuid.uuid.reshape(4, 4).reshape(-1)):
+            with pytest.raises(WrongValue, match="field 'uuid"):
+                numbers[place] = value
+        assert uuid == UUID()
+
+    def test_an_element_is_converted_as_a_field_is(self) -> None:
+        imu, uuid = Imu(), UUID()
+        imu.orientation_covariance[0] = 0.1
+        imu.orientation_covariance.reshape(3, 3)[1, 1] = numpy.float32(0.5)
+        imu.orientation_covariance[[2, 8]] = 2
+        uuid.uuid[3] = 7.0
+        assert imu.orientation_covariance.tolist() == [0.1, 0, 2, 0, 0.5, 0, 0, 0, 2]
+        assert uuid.uuid[3] == 7
+        assert checked(imu) is imu
+
+    def test_what_a_plugin_computes_from_a_field_is_its_own(self) -> None:
+        halves = UUID().uuid + 1
+        halves[0] = 2.5
+        assert (type(halves), halves[0]) == (numpy.ndarray, 2)
+        own = UUID().uuid.copy()
+        own[0] = 2.5
+        assert own[0] == 2
+        assert type(UUID().uuid.sum()) is numpy.uint64
+        assert copy.deepcopy(UUID(uuid=[1] * 16).uuid).tolist() == [1] * 16
+        assert pickle.loads(pickle.dumps(UUID().uuid)).tolist() == [0] * 16
+        assert repr(UUID().uuid) == repr(numpy.zeros(16, numpy.uint8))
+
+    def test_a_message_within_another_keeps_the_rule(self) -> None:
+        odometry = Odometry()
+        with pytest.raises(WrongValue, match="field 'covariance'"):
+            odometry.pose.covariance[0] = "12"
+
+    def test_ros_own_checks_are_made_where_the_user_has_asked_for_them(self) -> None:
+        with pytest.raises(AssertionError):
+            LaserScan(check_fields=True).ranges = ["1"]
 
 
 class TestMessages:

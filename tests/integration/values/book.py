@@ -2,7 +2,7 @@
 
 from neuros.hooks import neuros_function
 
-INPUTS = ("twist", "flag", "colour", "poses", "count")
+INPUTS = ("twist", "flag", "colour", "poses", "count", "odometry", "levels")
 
 
 @neuros_function(inputs=[*INPUTS, "said"])

@@ -3,17 +3,18 @@
 import os
 
 import numpy as np
-from geometry_msgs.msg import Pose
+from geometry_msgs.msg import Pose, PoseWithCovariance
+from std_msgs.msg import Float32MultiArray
 
 from neuros.hooks import neuros_function, neuros_initialise, neuros_tick
 
-OUTPUTS = ("twist", "flag", "colour", "poses", "count", "own")
+OUTPUTS = ("twist", "flag", "colour", "poses", "count", "own", "odometry", "levels")
 WRONG = os.environ.get("WRONG", "")
 
 
 @neuros_initialise(outputs=OUTPUTS)
 def send(node):
-    twist, flag, colour, poses, count, own = map(node.make_packet, OUTPUTS)
+    twist, flag, colour, poses, count, own, odometry, levels = map(node.make_packet, OUTPUTS)
     twist.linear.x = 1
     twist.linear.y = np.float32(0.5)
     twist.angular.z = np.array([2.5])
@@ -25,13 +26,24 @@ def send(node):
     poses.poses[3].position.y = 7
     count.data = np.int64(44)
     own.data = 1 / 3
+    odometry.pose.covariance = np.eye(6, dtype=int)
+    odometry.pose.covariance[1, 1] = np.float32(0.5)
+    levels.data = [1, 0.1, float("inf")]
     if WRONG == "text":
         twist.linear.x = "fast"
     elif WRONG == "nested":
         poses.poses[3].position.y = "up"
     elif WRONG == "range":
         count.data = 300
-    return twist, flag, colour, poses, count, own
+    elif WRONG == "fixed":
+        odometry.pose = PoseWithCovariance(covariance=["12"] * 36)
+    elif WRONG == "element":
+        odometry.pose.covariance[1, 1] = None
+    elif WRONG == "large":
+        levels.data = [0.5, 1e39]
+    elif WRONG == "made":
+        levels = Float32MultiArray(data=np.array([0.5, 1e39]))
+    return twist, flag, colour, poses, count, own, odometry, levels
 
 
 @neuros_tick(seconds=0.05, outputs="said")
