@@ -234,11 +234,15 @@ class Verdict:
         difference: where the runs parted first, in a sentence; ``None`` if they are identical.
         remarks: what differs and may, and what could not be compared.
         compared: packets that were found equal.
+        consumed_differently: connections that carried the same packets, of which hooks took others.
+        not_compared: connections of which not all packets could be compared.
     """
 
     difference: str | None
     remarks: tuple[str, ...]
     compared: int
+    consumed_differently: tuple[str, ...] = ()
+    not_compared: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -254,13 +258,15 @@ class _Difference:
 
 
 def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> Verdict:
-    """Compare what was sent on every connection, and what hooks took on those that lose nothing.
+    """Compare what was sent on every connection, and what hooks took of it.
 
     Where nodes have kept no digests, packets are taken from the bags of the runs. Of connections
-    that may lose packets it depends on the moment which ones hooks get: that is told as a remark.
+    that may lose packets it depends on the moment which ones hooks get: that is told apart.
     """
     found: list[_Difference] = []
     remarks: list[str] = []
+    differing: list[str] = []
+    incomplete: list[str] = []
     compared = 0
     names = [*a.connections, *(name for name in b.connections if name not in a.connections)]
     for name in names:
@@ -268,7 +274,9 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> Verdict:
             only = "A" if name in a.connections else "B"
             found.append(_Difference(-1.0, f"{name}: only run {only} has this connection"))
             continue
-        compared += _compare_connection(name, (a, b), recorded, found, remarks)
+        compared += _compare_connection(
+            name, (a, b), recorded, found, remarks, differing, incomplete
+        )
     first = min(found, key=lambda difference: difference.at_ns, default=None)
     others = len(found) - 1
     if others > 0:
@@ -277,7 +285,7 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> Verdict:
     text = None if first is None else first.text
     if first is not None and first.packet is not None:  # a bag is read for the first one only
         text = f"{first.text} {_field((a.folder, b.folder), *first.packet, recorded)}"
-    return Verdict(text, tuple(remarks), compared)
+    return Verdict(text, tuple(remarks), compared, tuple(differing), tuple(incomplete))
 
 
 def _compare_connection(
@@ -286,13 +294,16 @@ def _compare_connection(
     recorded: RecordedPackets,
     found: list[_Difference],
     remarks: list[str],
+    differing: list[str],
+    incomplete: list[str],
 ) -> int:
-    """Returns how many packets were found equal."""
+    """Returns how many packets were found equal; adds to the four lists."""
     a, b = runs
     in_a, in_b = _packets(name, runs, recorded)
     sent = [(run.connections[name]["sent"], p) for run, p in ((a, in_a), (b, in_b))]
     lacking = [_lacks_digests(*each) for each in sent]
     if any(lacking):
+        incomplete.append(name)
         folders = [run.folder for run, lacks in zip(runs, lacking, strict=True) if lacks]
         remarks.append(
             f"{name}: not compared, since {' and '.join(dict.fromkeys(map(str, folders)))} has"
@@ -316,15 +327,19 @@ def _compare_connection(
         if cut_off:
             remarks.append(f"{name}: compared up to packet {end}; later packets have no digests")
     compared = _first_difference(in_a.sent, in_b.sent)
-    is_whole = not (cut_off or in_a.before or in_b.before)
-    taken = _taken(name, in_a, in_b) if is_whole else None
+    if cut_off or in_a.before or in_b.before:
+        incomplete.append(name)
+        taken = _counted(name, runs)
+    else:
+        taken = _taken(name, in_a, in_b) or _counted(name, runs)
     difference = _sent(name, in_a, in_b)
     if difference is not None:
         found.append(difference)
     elif taken is not None and a.connections[name]["discard_limit"] == 0:
         found.append(taken)
     elif taken is not None:
-        remarks.append(f"{taken.text}: allowed, since this connection may lose packets")
+        differing.append(name)
+        remarks.append(f"{taken.text}: this connection may lose packets")
     return compared
 
 
@@ -407,6 +422,14 @@ def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     else:
         what = f"hooks took different packets as number {place + 1}"
     return _Difference(at_ns, f"{name}: {what}")
+
+
+def _counted(name: str, runs: tuple[PastRun, PastRun]) -> _Difference | None:
+    """What the counters of both runs say where there are no lists of what hooks took."""
+    a, b = (run.connections[name].get("consumed") for run in runs)
+    if a is None or b is None or a == b:
+        return None
+    return _Difference(np.inf, f"{name}: hooks took {a} packets in run A, and {b} in run B")
 
 
 def _first_difference(a: Numbers, b: Numbers) -> int:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 EXIT_DIFFERENT = 1
 EXIT_UNKNOWN = EXIT_LEFT_OUT = 2
 EXIT_DAMAGED = 4
+EXIT_CONSUMED = 6
 _PAGE = "report.html"
 
 
@@ -184,7 +185,10 @@ def add_verify(verify: argparse.ArgumentParser) -> None:
         " connection, packet and, if both runs were recorded, field. For a run that was started"
         " in parts, name a folder that holds the run folders of all parts."
     )
-    verify.epilog = "exit codes: 0 identical, 1 different, 2 nothing to compare"
+    verify.epilog = (
+        "exit codes: 0 identical, 1 different, 2 nothing to compare, 6 the same packets were sent,"
+        " but hooks took others of them"
+    )
     verify.add_argument("run_a", metavar="RUN_A", type=Path, help="a run folder")
     verify.add_argument("run_b", metavar="RUN_B", type=Path, help="another one")
     add_format(verify)
@@ -199,20 +203,38 @@ def _verify(options: argparse.Namespace) -> int:
     recorded = RecordedPackets()
     verdict = compare(a, b, recorded)
     remarks = [*recorded.remarks, *verdict.remarks]
-    result, exit_code = "identical", 0
+    packets = counted(verdict.compared, "packet")
+    result, exit_code, what = "identical", 0, packets
     if verdict.difference is not None:
-        result, exit_code = "different", EXIT_DIFFERENT
+        result, exit_code, what = "different", EXIT_DIFFERENT, verdict.difference
     elif not verdict.compared and verdict.remarks:
-        result, exit_code = "unknown", EXIT_UNKNOWN
+        result, exit_code, what = "unknown", EXIT_UNKNOWN, "there is nothing to compare"
+    elif taken := verdict.consumed_differently:
+        result, exit_code = "sent packets identical", EXIT_CONSUMED
+        what = f"{packets}; {_were(taken)} consumed differently"
+    if verdict.not_compared and exit_code in (0, EXIT_CONSUMED):
+        what += f"; {_were(verdict.not_compared)} not compared, or not to the end"
     if options.format == JSON:
-        found = {"packets": verdict.compared, "difference": verdict.difference, "notes": remarks}
-        print_json({"verdict": result, **found})
+        print_json(
+            {
+                "verdict": result,
+                "packets": verdict.compared,
+                "difference": verdict.difference,
+                "consumed_differently": verdict.consumed_differently,
+                "not_compared": verdict.not_compared,
+                "notes": remarks,
+            }
+        )
         return exit_code
     for remark in remarks:
         print(f"note: {remark}")
-    why = {"different": verdict.difference, "unknown": "there is nothing to compare"}
-    print(f"{result}: {why.get(result, counted(verdict.compared, 'packet'))}")
+    print(f"{result}: {what}")
     return exit_code
+
+
+def _were(connections: Sequence[str]) -> str:
+    verb = "was" if len(connections) == 1 else "were"
+    return f"{counted(len(connections), 'connection')} {verb}"
 
 
 def add_bag(bag: argparse.ArgumentParser) -> None:

@@ -158,12 +158,13 @@ def test_packets_that_are_counted_and_not_listed_are_not_said_to_be_identical(
     folders: tuple[Path, Path], listed_in_b: list[int], compared: int, difference: str | None
 ) -> None:
     a, b = run(folders[0], {FIRST: [1, 2, 3]}), run(folders[1], {FIRST: listed_in_b})
-    b.connections[FIRST]["sent"] = 3  # type: ignore[index]
+    b.connections[FIRST].update(sent=3, consumed=3)  # type: ignore[attr-defined]
     found = verdict(a, b)
     assert found.compared == compared
     assert found.remarks == (f"{FIRST}: compared up to packet 2; later packets have no digests",)
     assert (found.difference or "").startswith(difference or "")
     assert (found.difference is None) == (difference is None)
+    assert found.not_compared == (FIRST,)
 
 
 def test_one_that_may_lose_packets_may_have_lost_others(folders: tuple[Path, Path]) -> None:
@@ -172,6 +173,16 @@ def test_one_that_may_lose_packets_may_have_lost_others(folders: tuple[Path, Pat
     found = verdict(a, b)
     assert found.difference is None
     assert "may lose packets" in found.remarks[0]
+    assert found.consumed_differently == (FIRST,)
+
+
+def test_counters_tell_what_lists_of_packets_do_not(folders: tuple[Path, Path]) -> None:
+    a, b = (run(folder, {FIRST: [1, 2]}, discard_limit=None) for folder in folders)
+    assert verdict(a, b).consumed_differently == ()
+    b.connections[FIRST]["consumed"] = 1  # type: ignore[index]
+    found = verdict(a, b)
+    assert found.consumed_differently == (FIRST,)
+    assert "hooks took 2 packets in run A, and 1 in run B" in found.remarks[0]
 
 
 def test_a_connection_that_only_one_run_has_is_a_difference(folders: tuple[Path, Path]) -> None:

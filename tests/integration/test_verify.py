@@ -253,3 +253,51 @@ def test_a_recorded_run_without_a_packet_log_can_be_replayed(tmp_path: Path) -> 
     replayed = replay(tmp_path / "run", "a")
     assert replayed.returncode == 0, replayed.stderr
     assert f"{TICKS} packets" in replayed.stdout
+SERVER = """
+from neuros.hooks import neuros_initialise
+
+@neuros_initialise(outputs="ball")
+def serve(node):
+    return node.make_packet("ball")
+"""
+CATCHER = """
+import os
+from neuros.hooks import Optional, neuros_function
+
+@neuros_function(inputs=["ball", "own"] if os.environ["WAITS"] else "ball", outputs=Optional("own"))
+def catch(node, *packets):
+    node.shutdown("caught")
+"""
+
+
+@pytest.mark.parametrize("arguments", [("process",), ("in-process", "--digests")])
+def test_runs_whose_hooks_took_other_packets_are_not_said_to_be_identical(
+    tmp_path: Path, arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "server.py").write_text(SERVER)
+    (tmp_path / "catcher.py").write_text(CATCHER)
+    ball, own = ({"name": name, "type": "std_msgs/msg/Int32"} for name in ("ball", "own"))
+    nodes = [
+        {"name": "ann", "container": "neuros_python", "plugin": "server.py", "outputs": [ball]},
+        {"name": "bob", "container": "neuros_python", "plugin": "catcher.py",
+         "environment": {"WAITS": ""}, "inputs": [ball, own], "outputs": [own]},
+    ]  # fmt: skip
+    connections = [
+        {"source_node": node, "source_output": port, "destination_node": "bob",
+         "destination_input": port}
+        for node, port in (("ann", "ball"), ("bob", "own"))
+    ]  # fmt: skip
+    project = tmp_path / "project.json"
+    project.write_text(json.dumps({"nodes": nodes, "connections": connections}))
+    options = ("--backend", *arguments)
+    first, again = (run(tmp_path / name, *options, project=project) for name in ("a", "b"))
+    assert verify(first, again, capsys) == (0, "identical: 1 packet\n")
+    waits = ("--set", "nodes.bob.environment.WAITS=yes", "--duration", "1")
+    other = run(tmp_path / "c", *options, *waits, project=project)
+    code, text = verify(first, other, capsys)
+    assert code == 6
+    assert text == (
+        "note: ann.ball -> bob.ball: hooks took 1 packets in run A, and 0 in run B: this"
+        " connection may lose packets\n"
+        "sent packets identical: 1 packet; 1 connection was consumed differently\n"
+    )
