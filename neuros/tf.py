@@ -13,7 +13,7 @@ from another; :func:`transform` makes a message to send::
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -56,6 +56,10 @@ class _Pose:
 class TransformBuffer:
     """Keeps transforms for a while and chains them.
 
+    Time that goes back, as that of a simulator which is reset, begins anew: a transform with an
+    earlier stamp than the one before it of the same frame drops all that lie after it, of every
+    frame. Static ones stay.
+
     Args:
         cache_s: how long those of ``/tf`` are kept behind the newest one of the same frame.
     """
@@ -89,6 +93,12 @@ class TransformBuffer:
         """
         down, up = self._way(target, source)
         moving = [frame for frame in (*down, *up) if frame not in self._static]
+        for frame in moving:
+            if not self._poses[frame]:
+                raise TransformError(
+                    f"'{frame}' in '{self._parents[frame]}': nothing is known since time has gone"
+                    " back"
+                )
         if at is None:
             at_ns = min((self._poses[frame][-1].at_ns for frame in moving), default=0)
         else:
@@ -107,13 +117,18 @@ class TransformBuffer:
         self._parents[frame] = parent
         self._static.add(frame) if is_static else self._static.discard(frame)
         poses = self._poses[frame]
-        place = bisect_left(poses, pose)
-        if place < len(poses) and poses[place].at_ns == pose.at_ns:
-            poses[place] = pose
-        else:
-            insort(poses, pose)
+        if poses and pose < poses[-1]:
+            self._go_back_to(pose)
+        if poses and poses[-1] == pose:  # of the same time
+            del poses[-1]
+        poses.append(pose)
         while poses[-1].at_ns - poses[0].at_ns > self._cache_ns:
             del poses[0]
+
+    def _go_back_to(self, pose: _Pose) -> None:
+        for frame, poses in self._poses.items():
+            if frame not in self._static:
+                del poses[bisect_right(poses, pose) :]
 
     def _way(self, target: str, source: str) -> tuple[list[str], list[str]]:
         """The frames from the target, and from the source, to what both are in."""

@@ -175,8 +175,9 @@ def time_figure(run: PastRun) -> Any | None:
     for place, (name, points) in enumerate(timelines.items()):
         sims, walls = np.transpose(points)
         left.plot(walls, sims, color=colour(place), label=name, marker="o", markersize=3)
-        passed_s = np.diff(walls)
-        factors = np.diff(sims)[passed_s > 0] / passed_s[passed_s > 0]
+        passed_s, advance_s = np.diff(walls), np.diff(sims)
+        is_shown = (passed_s > 0) & (advance_s >= 0)  # a reset is no advance
+        factors = advance_s[is_shown] / passed_s[is_shown]
         right.step(range(1, len(factors) + 1), factors, where="mid", color=colour(place))
     low, high = left.get_xlim()
     left.axline((low, low), slope=1, color=GREY, linestyle="--", linewidth=1, label="real time")

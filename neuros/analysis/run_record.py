@@ -112,11 +112,11 @@ def consumed_percent(connection: Mapping[str, Any]) -> float | None:
 
 
 def _timeline(points: Sequence[Sequence[float]], ended: Outcome) -> list[list[float]]:
-    """Points of simulated and wall time, both growing; wall time from the first hook on."""
+    """Points of simulated and wall time, from the first hook on; a reset takes the first back."""
     start_s = ended.started_s or 0.0
     found: list[list[float]] = []
     for sim_s, wall_s in points:
-        if not found or int(sim_s) > int(found[-1][0]):
+        if not found or int(sim_s) > int(found[-1][0]) or sim_s < found[-1][0]:
             found.append([round(sim_s, 6), round(wall_s - start_s, 6)])
     return found
 

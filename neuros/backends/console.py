@@ -455,6 +455,8 @@ class Progress:
             sum(c["sent"] for metrics in all_metrics for c in metrics["outgoing"].values()),
             sum(c["discarded"] for metrics in all_metrics for c in metrics["incoming"].values()),
         )
+        if self._readings and (self._readings[-1].sim_s or 0.0) > (reading.sim_s or 0.0):
+            self._readings.clear()  # a simulator was reset: rates begin anew
         if not self._readings or self._readings[-1][1:] != reading[1:]:
             self._readings.append(reading)
         while len(self._readings) > 2 and reading.wall_s - self._readings[0].wall_s > _WINDOW_S:

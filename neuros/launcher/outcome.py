@@ -7,6 +7,7 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import pairwise
 from typing import Any, Protocol
 
 from neuros.control import Report
@@ -122,7 +123,8 @@ class Outcome:
         owner = max(times, key=times.__getitem__)
         # Running time leaves pauses out, points of a timeline do not.
         start_s = self.ending_s - running_s - self.paused_s
-        return (times[owner] - _simulated(self.timelines.get(owner, ()), start_s)) / running_s
+        end = (times[owner], self.ending_s)
+        return _advance(self.timelines.get(owner, ()), start_s, end) / running_s
 
     def take(self, report: Report, now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""
@@ -160,13 +162,22 @@ class Outcome:
             self.exit_code, self.reason = exit_code, reason
 
 
+def _advance(
+    timeline: Sequence[Sequence[float]], start_s: float, end: tuple[float, float]
+) -> float:
+    """The simulated time that has passed since a wall time; what a reset takes back has passed."""
+    after = bisect_right(timeline, start_s, key=lambda point: point[1])
+    points = [(_simulated(timeline, start_s), start_s), *timeline[after:], end]
+    return sum(max(0.0, later[0] - earlier[0]) for earlier, later in pairwise(points))
+
+
 def _simulated(timeline: Sequence[Sequence[float]], wall_s: float) -> float:
     """The simulated time at a wall time, between two points linearly; 0 before the first one."""
     after = bisect_right(timeline, wall_s, key=lambda point: point[1])
     if after == 0:
         return 0.0
     (sim_s, since_s), following = timeline[after - 1], timeline[after:]
-    if not following:
+    if not following or following[0][0] < sim_s:
         return float(sim_s)
     next_sim_s, next_s = following[0]
     return float(sim_s + (next_sim_s - sim_s) * (wall_s - since_s) / (next_s - since_s))

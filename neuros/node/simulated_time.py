@@ -134,16 +134,23 @@ class Timeline:
         self._next_s = 0.0
         self._next_wall_s = -math.inf
         self._fine_until_s: float | None = None
+        self._last = (-math.inf, -math.inf)
         self._points: list[tuple[float, float]] = []
 
     def note(self, sim_s: float, wall_s: float) -> None:
         """It is ``sim_s`` now; the first reading in each simulated second is kept.
+
+        Where time goes back, since a simulator was reset, so are the last reading and the new one.
 
         In the first minute there is a reading each tenth of a second besides: the other nodes
         initialise then, and the real-time factor begins when the last one has.
         """
         if self._fine_until_s is None:
             self._fine_until_s = wall_s + _FINE_S
+        if sim_s < self._last[0]:
+            self._points.append(self._last)
+            self._next_s = sim_s
+        self._last = (sim_s, wall_s)
         if sim_s >= self._next_s or self._next_wall_s <= wall_s < self._fine_until_s:
             self._next_s = math.floor(sim_s) + 1.0
             self._next_wall_s = wall_s + _FINE_INTERVAL_S

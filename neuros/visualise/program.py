@@ -10,6 +10,7 @@ import signal
 import struct
 import sys
 import time
+from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,10 @@ _GREY, _ALPHA = "0.6", 0.9
 
 
 class Series:
-    """Values over time: the last ``duration_s`` seconds, or all, and of very many every other."""
+    """Values over time: the last ``duration_s`` seconds, or all, and of very many every other.
+
+    Where time goes back, it drops what lies after.
+    """
 
     def __init__(self, duration_s: float | None) -> None:
         self._duration_s = duration_s
@@ -37,6 +41,9 @@ class Series:
     def add(self, time_s: float, value: Any) -> None:
         if not math.isfinite(time_s):
             return  # there is no place for it
+        if self.times and time_s < self.times[-1]:  # a simulator was reset: what lay after is gone
+            kept = bisect_right(self.times, time_s)
+            del self.times[kept:], self.values[kept:]
         self.times.append(time_s)
         self.values.append(value)
         if len(self.times) > _MOST_POINTS:

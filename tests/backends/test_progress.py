@@ -51,6 +51,13 @@ def test_simulated_time_has_its_speed_and_the_time_that_is_left() -> None:
     )
 
 
+def test_after_a_reset_the_speed_is_that_of_the_time_since() -> None:
+    reports = [report(4.0, 0), report(8.0, 400), report(0.0, 800), report(2.0, 1200)]
+    assert run(Clock(), reports).text() == (
+        "2.0 s simulated, 2.00 x real time, 400 packets/s, 0 discarded"
+    )
+
+
 def paused_run(clock: Clock, **end: float) -> tuple[Outcome, Progress]:
     """Four simulated seconds in one of wall time, and then a pause of a minute."""
     outcome = Outcome(started_s=clock())

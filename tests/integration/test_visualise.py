@@ -27,6 +27,7 @@ from neuros.visualise import (
     VisualiseRotations,
     VisualiseSpikes,
 )
+from neuros.visualise.program import Series
 
 DEADLINE_S = 30.0
 
@@ -98,6 +99,13 @@ def test_every_kind_of_figure_is_saved_and_parts_may_share_one(tmp_path: Path) -
     assert red_rows.size > 10_000, "the image"
     assert pink_rows.size > 20, "the spikes"
     assert red_rows.mean() < pink_rows.mean(), "below the image"
+
+
+def test_where_time_goes_back_what_lay_after_is_dropped() -> None:
+    series = Series(None)
+    for time_s, value in ((0.0, "a"), (1.0, "b"), (2.0, "c"), (0.5, "d"), (1.5, "e")):
+        series.add(time_s, value)
+    assert (series.times, series.values) == ([0.0, 0.5, 1.5], ["a", "d", "e"])
 
 
 def test_ros_images_are_shown_in_their_colours() -> None:

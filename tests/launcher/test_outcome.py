@@ -48,3 +48,10 @@ def test_without_simulated_time_there_is_none() -> None:
     ended = outcome(1.0, [])
     ended.reports["robot"] = replace(ended.reports["robot"], sim_time=None)
     assert ended.real_time_factor is None
+
+
+def test_what_a_reset_takes_back_has_passed() -> None:
+    points = [(0.0, 10.0), (2.0, 12.0), (8.0, 18.0), (0.0, 18.0), (1.0, 19.0)]
+    assert outcome(4.0, points).real_time_factor == pytest.approx(1.0)
+    points = [(0.0, 10.0), (3.0, 11.0), (0.0, 13.0)]  # reset while the plot initialised
+    assert outcome(10.0, points).real_time_factor == pytest.approx(1.0)

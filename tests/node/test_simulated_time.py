@@ -44,3 +44,14 @@ def test_seconds_that_are_jumped_over_have_no_point(timeline: Timeline) -> None:
     timeline.note(7.9, LATER_S + 1)
     timeline.note(8.1, LATER_S + 2)
     assert timeline.take() == [(7.5, LATER_S), (8.1, LATER_S + 2)]
+
+
+def test_where_time_goes_back_the_last_reading_and_the_new_one_are_kept(timeline: Timeline) -> None:
+    for place, sim_s in enumerate((7.5, 7.9, 0.2, 0.4, 1.5)):
+        timeline.note(sim_s, LATER_S + place)
+    assert timeline.take() == [
+        (7.5, LATER_S),
+        (7.9, LATER_S + 1),
+        (0.2, LATER_S + 2),
+        (1.5, LATER_S + 4),
+    ]

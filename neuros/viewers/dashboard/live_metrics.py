@@ -96,13 +96,15 @@ class Latency:
 
 
 class Speed:
-    """Growth of a counter, over :data:`WINDOW_S`."""
+    """Growth of a counter, or of a time, over :data:`WINDOW_S`; one that goes back begins anew."""
 
     def __init__(self) -> None:
         self._points: deque[tuple[float, float]] = deque()
 
     def note(self, now_s: float, value: float) -> None:
         """It has that value now."""
+        if self._points and value < self._points[-1][1]:
+            self._points.clear()
         self._points.append((now_s, value))
         while len(self._points) > 2 and now_s - self._points[1][0] >= WINDOW_S:
             self._points.popleft()

@@ -44,6 +44,13 @@ def test_rates_are_those_of_the_last_second() -> None:
     assert figures.connections[LINK]["rate_hz"] == pytest.approx(100.0)
 
 
+def test_the_rate_of_what_goes_back_begins_anew() -> None:
+    figures = LiveMetrics()
+    for tenth, sent in enumerate((50, 60, 70, 0, 10)):
+        figures.take(node_status("a", 100 + tenth / 10, outgoing=outgoing(sent)))
+    assert figures.connections[LINK]["rate_hz"] == pytest.approx(100.0)
+
+
 def test_a_connection_has_the_counters_of_both_its_ends() -> None:
     figures = LiveMetrics()
     figures.take(node_status("b", 1.0, incoming=incoming(7, discarded=2)))

@@ -26,7 +26,7 @@ export class SpikeTrain {
       lastS = Math.max(lastS, timeS);
     }
     // A simulation that was reset begins again.
-    if (this.endS !== null && lastS < this.endS - this.keptS) this.forget();
+    if (this.endS !== null && lastS < this.endS) this.forget();
     this.size = Math.max(this.size, size, senders.reduce((most, each) => Math.max(most, each + 1), 0));
     this.endS = Math.max(this.endS ?? lastS, lastS);
     this.beginS ??= Math.min(firstS, lastS);
