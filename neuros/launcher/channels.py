@@ -15,7 +15,7 @@ import contextlib
 import selectors
 import socket
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -283,19 +283,25 @@ class Observers:
     Args:
         _is_driven: whether some node starts hooks unasked, and so drives the project.
         _end: ends the run, drained: ``end(reason)``.
+        _session_inputs: ``(node, input)`` of those that a session may send to; none in other runs.
     """
 
     _channels: Channels
     _pause: PauseState
     _is_driven: Callable[[], bool]
     _end: Callable[[str], None]
+    _session_inputs: Container[tuple[str, str]] = ()
     _links: dict[int, ControlLink] = field(default_factory=dict)  # numbers are not given out again
     _count: int = 0
     _told: control.PhaseChanged | None = None
     _asked: dict[int, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
     def take(self, link: ControlLink, message: Message) -> None:
-        """Take a message from or for an observer."""
+        """Take a message from or for an observer.
+
+        Raises:
+            ControlError: if it is a packet for what is no session's input; nothing has changed.
+        """
         match message:
             case control.Watch() if link not in self._links.values():
                 self._count += 1
@@ -321,7 +327,10 @@ class Observers:
                     self._channels.send_to(link, control.WasReset(f"its nodes {why}"))
             case control.WasReset():
                 self.tell(message)
-            case control.Deliver(node=node):
+            case control.Deliver(node, input_name):
+                if (node, input_name) not in self._session_inputs:
+                    whither = f"'{node}.{input_name}'"
+                    raise ControlError(f"a packet came for {whither}, no session's input")
                 self._channels.send_to_node(node, message)
             case control.StepAll(count):
                 self._pause.step(count, is_driven=self._is_driven())

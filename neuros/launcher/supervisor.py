@@ -141,6 +141,12 @@ class Supervisor:
             self.pause,
             lambda: self._detector.is_driven,
             lambda reason: self._shutdown.drain(reason, DRAIN_S),
+            {
+                (file.node.name, port.name)
+                for file in files
+                for port in file.node.inputs
+                if is_held and port.external_topic is not None
+            },
         )
         self._signals = signals
         self._refused: set[ControlLink] = set()
@@ -181,10 +187,13 @@ class Supervisor:
             if isinstance(message, ControlError):
                 self._refuse(link, message)
             else:
-                self._take(link, message)
+                try:
+                    self._take(link, message)
+                except ControlError as error:
+                    self._refuse(link, error)
 
     def _refuse(self, link: ControlLink, error: ControlError) -> None:
-        """A message was not understood: without it, nothing is known of a node for sure."""
+        """A message is wrong: without it, nothing is known of a node for sure."""
         if self._channels.nodes_of(link):
             if link not in self._refused:
                 self._refused.add(link)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +16,7 @@ from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
-from neuros.errors import ControlError, HookError, NeurosError
+from neuros.errors import ControlError, HookError, NeurosError, ProtocolError
 from neuros.hooks import HookKind, HookSpec
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import Failures
@@ -315,6 +316,17 @@ class NodeRuntime:
         if port is None or port.external_topic is None:
             raise ControlError(f"a packet came for '{self.name}.{input_name}', no session's input")
         self.on_external_packet(port, self._middleware.packets.decode(port.type, data))
+
+    def deliver_if_right(self, input_name: str, data: str) -> None:
+        """An observer sends a packet to an input of the session, in base64.
+
+        What is none is refused in the log: an observer ends no run by a mistake.
+        """
+        try:
+            self.deliver(input_name, base64.b64decode(data))
+        except (ControlError, ProtocolError, ValueError) as error:
+            self._enter()  # the log is that of its own
+            self._logger.warning(f"a packet for input '{input_name}' is refused: {error}")
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """The receiver of a connection has started on packets."""

@@ -176,7 +176,7 @@ class NodeProcess:
                 case control.Step(count, is_driven):
                     node.step(count, is_driven=is_driven)
                 case control.Deliver(name, input_name, data) if name == node.name:
-                    node.deliver(input_name, _from_base64(data))
+                    node.deliver_if_right(input_name, data)
 
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""
@@ -601,13 +601,6 @@ def _at_rest(nodes: Sequence[NodeRuntime], asked: control.Settle) -> control.AtR
         {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None},
         packets,
     )
-
-
-def _from_base64(data: str) -> bytes:
-    try:
-        return base64.b64decode(data)
-    except ValueError as error:
-        raise ControlError(f"a packet came that is not in base64: {error}") from None
 
 
 def _filenames(error: BaseException) -> Iterator[str]:

@@ -27,9 +27,21 @@ from test_python_api import thrown
 
 import neuros
 from containers import require_containers, wait_until
+from neuros.api.live import LiveRun
 from neuros.api.session import Session
+from neuros.backends.control_sockets import connect
 from neuros.cli.main import main
-from neuros.control import AtRest, Deliver, Message, Resume, Settle, StepAll
+from neuros.control import (
+    TO_OBSERVERS,
+    AtRest,
+    Deliver,
+    LogRecord,
+    Message,
+    Resume,
+    Settle,
+    StepAll,
+    Watch,
+)
 from neuros.control.link import ControlLink
 from neuros.control.steps import Advance
 from neuros.errors import ProjectError, RunError, UsageError
@@ -407,24 +419,70 @@ def test_a_step_goes_by_the_supervisor_where_the_nodes_are_out_of_reach(
         assert poses(s, 1) == [8.125]
 
 
+def observer_of(live: LiveRun) -> ControlLink:
+    """An observer, as soon as the run can be observed."""
+    deadline_s = time.monotonic() + DEADLINE_S
+    while True:
+        try:
+            link = ControlLink(connect(live.control_address), TO_OBSERVERS, "the supervisor")
+        except OSError:
+            assert time.monotonic() < deadline_s
+        else:
+            link.send(Watch())
+            return link
+
+
+def refusals(live: LiveRun, node_log: Path, *wrong: Deliver) -> str:
+    """What is said of wrong packets, each of an observer of its own."""
+    heard: list[str] = []
+    with contextlib.ExitStack() as stack:
+        listener = stack.enter_context(contextlib.closing(observer_of(live)))
+        listener.stream.setblocking(False)
+
+        def is_refused(packet: Deliver) -> bool:
+            heard.extend(m.text for m in listener.receive() or () if isinstance(m, LogRecord))
+            is_told = any(f"'{packet.node}.{packet.input}'" in text for text in heard)
+            return is_told or f"input '{packet.input}' is refused" in node_log.read_text("utf-8")
+
+        for packet in wrong:
+            stack.enter_context(contextlib.closing(observer_of(live))).send(packet)
+            wait_until(lambda packet=packet: is_refused(packet), DEADLINE_S)
+    return "\n".join([*heard, node_log.read_text("utf-8")])
+
+
 @pytest.mark.parametrize(
     ("input_name", "data", "reason"),
     [
         ("nothing", "AAAA", "a packet came for 'robot.nothing', no session's input"),
         ("wheels", "AAAA", "a packet came for 'robot.wheels', no session's input"),
-        ("push", "AAAA", "3 bytes are not a std_msgs/Float64"),
-        ("push", "A", "a packet came that is not in base64"),
+        ("push", "AAAA", "input 'push' is refused: 3 bytes are not a std_msgs/Float64"),
+        ("push", "A", "a packet for input 'push' is refused: Invalid base64"),
     ],
 )
-def test_a_wrong_packet_on_the_control_channel_fails_the_run_in_a_sentence(
-    tmp_path: Path, input_name: str, data: str, reason: str
+@pytest.mark.parametrize("back_end", ["in-process", "process"])
+def test_a_wrong_packet_of_an_observer_is_refused_and_the_session_goes_on(
+    tmp_path: Path, back_end: str, input_name: str, data: str, reason: str
 ) -> None:
-    with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
-        s._link.send(Deliver("robot", input_name, data))
-        run = s._live.wait(DEADLINE_S)
-    assert run.exit_code == 1
-    assert reason in run.reason
-    assert "Traceback" not in (s.folder / "robot" / "node.log").read_text("utf-8")
+    with neuros.Project.from_file(cart(tmp_path)).session(backend=back_end) as s:
+        log = s.folder / "robot" / "node.log"
+        assert reason in refusals(s._live, log, Deliver("robot", input_name, data))
+        assert poses(s, 2) == [1.0, 0.5]
+    assert s.close().exit_code == 0
+    assert "Traceback" not in log.read_text("utf-8")
+
+
+@pytest.mark.parametrize("back_end", ["in-process", "process"])
+def test_in_a_run_that_is_no_session_every_packet_of_an_observer_is_refused(
+    tmp_path: Path, back_end: str
+) -> None:
+    live = neuros.Project.from_file(cart(tmp_path)).start(backend=back_end)
+    log = live.folder / "robot" / "node.log"
+    wait_until(log.exists, DEADLINE_S)
+    names = ("push", "wheels", "nothing")
+    told = refusals(live, log, *(Deliver("robot", name, "AAEAAAEAAAA=") for name in names))
+    assert all(f"a packet came for 'robot.{name}', no session's input" in told for name in names)
+    live.stop("enough")
+    assert live.wait(DEADLINE_S).exit_code == 0
 
 
 def test_a_step_with_a_packet_for_no_node_fails_the_run_in_a_sentence(tmp_path: Path) -> None:
