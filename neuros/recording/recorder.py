@@ -201,6 +201,8 @@ class Recorder:
             return [], False
         try:
             records, is_capped = source.reader.read(_MOST_BYTES)
+            if source.reader.is_damaged:
+                self._complain_of(source)
             if source is self._listener and records:
                 heard = listened_topics(self._run)
                 self._listener.topics = [self._numbers([topic]) for topic in heard]
@@ -216,12 +218,15 @@ class Recorder:
         """The numbers of its topics; ``None`` if no node of NeuROS can have written it."""
         if record.stream < len(source.topics) and record.wall_ns >= 0 and record.sim_ns >= NO_TIME:
             return source.topics[record.stream]
+        self._complain_of(source)
+        return None
+
+    def _complain_of(self, source: _SpoolSource) -> None:
         if not source.is_damaged:
             source.is_damaged = True
             self._complain(
                 f"{source.reader} is damaged: packets in it are not recorded, and it is kept"
             )
-        return None
 
     def _write(
         self, wall_ns: int, sim_ns: int, topics: tuple[int, ...], data: bytes, owns_time: bool

@@ -32,6 +32,8 @@ from neuros.project.scanner import read_bytes
 from neuros.recording.recording_plan import LISTENER, RecordingPlan, Stream, Topic
 
 FILE_BYTES = 8 << 20
+MOST_BYTES = 1 << 27
+"""Of a packet: a file that a node has written may claim any size, and cost it no disk."""
 NO_TIME = -1
 
 _FOLDER = "spool"
@@ -103,6 +105,9 @@ class SpoolWriter:
 
     def append(self, wall_ns: int, sim_ns: int, stream: int, data: bytes) -> None:
         """Write what will be read as a :class:`Record`. Raises ``OSError``."""
+        if len(data) > MOST_BYTES:
+            why = f"a packet of {len(data)} bytes; {MOST_BYTES} are the most that can be recorded"
+            raise OSError(errno.EFBIG, why)
         if self._descriptor < 0 or self._size >= self._file_bytes:
             self._begin_file()
         header = _HEADER.pack(len(data), stream, wall_ns, sim_ns)
@@ -143,6 +148,7 @@ class SpoolReader:
         self._file: int | None = None
         self._descriptor = -1
         self._rest = b""
+        self._missing = 0  # bytes that complete the rest
         self._last_ns = 0
         self._done: list[tuple[int, int]] = []
 
@@ -150,17 +156,23 @@ class SpoolReader:
         """The next complete records, and whether there is more now."""
         records: list[Record] = []
         left = most_bytes
-        while left > 0:
+        while left > 0 and not self.is_damaged:
             if self._descriptor < 0 and not self._open_next():
                 return records, False
-            data = os.read(self._descriptor, left)
-            if data:
+            if self._is_there:  # a record that is larger than what is asked for comes whole
+                data = os.read(self._descriptor, max(left, self._missing))
                 left -= len(data)
                 self._rest = _split(self._rest + data if self._rest else data, records)
+                self._missing = _missing(self._rest)
                 self._last_ns = records[-1].wall_ns if records else self._last_ns
             elif not self._leave_file():
                 return records, False
-        return records, True
+        return records, not self.is_damaged
+
+    @property
+    def is_damaged(self) -> bool:
+        """Whether a record claims more than a packet may have; nothing behind it is read."""
+        return self._missing > MOST_BYTES
 
     def __str__(self) -> str:
         return str(self._folder / _FOLDER)
@@ -227,8 +239,14 @@ class SpoolReader:
             return False
         self._descriptor = self._open(numbers[0])
         self._file = numbers[0]
-        self._rest = b""
+        self._rest, self._missing = b"", 0
         return True
+
+    @property
+    def _is_there(self) -> bool:
+        """Whether the file has the rest of the record that has begun, or anything behind it."""
+        position = os.lseek(self._descriptor, 0, os.SEEK_CUR)
+        return os.fstat(self._descriptor).st_size - position >= max(1, self._missing)
 
     def _leave_file(self) -> bool:
         """Whether the writer has gone on to another file, so that this one will not grow."""
@@ -236,7 +254,7 @@ class SpoolReader:
         if not _path(self._folder / _FOLDER, self._file + 1).exists():
             return False
         # It may have grown between the look at its end and the look for the next.
-        if os.fstat(self._descriptor).st_size > os.lseek(self._descriptor, 0, os.SEEK_CUR):
+        if self._is_there:
             return True
         os.close(self._descriptor)
         self._descriptor = -1
@@ -260,6 +278,16 @@ def _split(data: bytes, records: list[Record]) -> bytes:
         records.append(Record(wall_ns, sim_ns, stream, data[at + head : after]))
         at = after
     return data[at:]
+
+
+def _missing(rest: bytes) -> int:
+    """So many bytes more complete a record, or its header, that has begun."""
+    if not rest:
+        return 0
+    whole = _HEADER.size
+    if len(rest) >= whole:
+        whole += _HEADER.unpack_from(rest)[0]
+    return whole - len(rest)
 
 
 _LIST = "topics.json"

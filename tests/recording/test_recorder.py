@@ -383,6 +383,25 @@ def test_a_plan_survives_its_file(tmp_path: Path) -> None:
     assert load_plan(tmp_path) == plan(time_owner="a")
 
 
+def test_a_record_that_claims_gigabytes_is_told_and_what_came_before_is_in_the_bag(
+    tmp_path: Path,
+) -> None:
+    spool(tmp_path, "a", [(10, None, number(7))])
+    (file,) = (tmp_path / "a" / "spool").iterdir()
+    with file.open("ab") as more:
+        more.write(b"\xff" * 4 + bytes(20))
+    os.truncate(file, 4 << 30)
+    told: list[str] = []
+    recorder = Recorder(plan(), tmp_path, told.append)
+    recorder.complete()
+    recorder.clean_up()
+    assert recorder.counts()["/neuros/a/number/b/number/data"] == 1
+    assert told == [
+        f"{tmp_path}/a/spool is damaged: packets in it are not recorded, and it is kept"
+    ]
+    assert file.exists()
+
+
 def test_packets_that_no_node_can_have_kept_are_told_once_and_stay_in_the_spool(
     tmp_path: Path,
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import time
 from itertools import count
 from pathlib import Path
@@ -110,6 +111,68 @@ def test_a_record_that_was_cut_off_is_left_out(tmp_path: Path) -> None:
     path = tmp_path / "spool" / name
     path.write_bytes(path.read_bytes()[:-1])
     assert [r.data for r in read_all(SpoolReader(tmp_path))] == [b"whole"]
+
+
+def test_a_record_that_claims_more_than_a_packet_may_have_costs_neither_time_nor_memory(
+    tmp_path: Path,
+) -> None:
+    spool = writer(tmp_path)
+    spool.keep(IMU, b"first", None)
+    spool.close()
+    (file,) = (tmp_path / "spool").iterdir()
+    with file.open("ab") as more:
+        more.write(struct.pack("<IIqq", 0xFFFFFFFF, 0, 0, NO_TIME))
+    os.truncate(file, 4 << 30)  # without a block on the disk
+    reader = SpoolReader(tmp_path)
+    assert [record.data for record in read_all(reader)] == [b"first"]
+    assert reader.is_damaged
+    assert reader.read(1 << 20) == ([], False)
+    reader.close(remove=False)
+
+
+def test_a_record_is_read_once_all_of_it_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However little is asked for at a time; else a large one took quadratic time."""
+    spool, large = writer(tmp_path), bytes(range(256)) * 4096
+    spool.keep(IMU, large, None)
+    (file,) = (tmp_path / "spool").iterdir()
+    content = file.read_bytes()
+    read, sizes = os.read, []
+    monkeypatch.setattr(os, "read", lambda *a: sizes.append(len(d := read(*a))) or d)
+    reader = SpoolReader(tmp_path)
+    os.truncate(file, len(content) // 2)
+    assert read_all(reader, 4096) == read_all(reader, 4096) == []
+    with file.open("r+b") as whole:
+        whole.write(content)
+    assert [record.data for record in read_all(reader, 4096)] == [large]
+    assert len(sizes) == 2
+    spool.keep(CAMERA, b"next", None)
+    assert [record.data for record in read_all(reader, 4096)] == [b"next"]
+    spool.close()
+    reader.close(remove=False)
+
+
+def test_a_cut_off_record_in_a_file_that_was_left_is_passed_over(tmp_path: Path) -> None:
+    spool = writer(tmp_path, file_bytes=1)
+    for data in (b"cut" * 50, b"whole"):
+        spool.keep(IMU, data, None)
+    spool.close()
+    os.truncate(tmp_path / "spool" / files(tmp_path)[0], 60)
+    reader = SpoolReader(tmp_path)
+    assert [record.data for record in read_all(reader)] == [b"whole"]
+    reader.close(remove=False)
+
+
+def test_a_packet_that_is_too_large_is_refused_by_its_writer(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("neuros.recording.spool.MOST_BYTES", 100)
+    spool = writer(tmp_path)
+    with pytest.raises(OSError, match="a packet of 101 bytes; 100 are the most"):
+        spool.keep(IMU, bytes(101), None)
+    spool.keep(IMU, bytes(100), None)
+    spool.close()
 
 
 def test_a_file_goes_only_once_its_last_packet_is_safe(tmp_path: Path) -> None:
