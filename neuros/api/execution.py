@@ -22,6 +22,7 @@ from neuros.api.run_folder import (
     log_of,
     make_run_folder,
     recording_of,
+    removed_folders,
     summary,
     write_node_files,
 )
@@ -181,7 +182,8 @@ class Execution:
             left_behind = self._plan.deployment.finish(lambda: len(self._signals) > before)
             recorded = None if recording is None else recording.finish(self._signals)
             observed, faults = observation.finish()
-            for fault in (*outcome.faults, *left_behind, *faults):
+            removed = removed_folders(self._files, self.folder)
+            for fault in (*removed, *outcome.faults, *left_behind, *faults):
                 outcome.fail(fault, EXIT_ENVIRONMENT)
             if self._views is not None:
                 self._views.finish()

@@ -73,6 +73,30 @@ def folders_of(plan: Plan, run_folder: Path) -> Folders:
     return Folders(plan.project.folder, WORKSPACE, run_folder)
 
 
+def removed_folders(files: Sequence[NodeFile], run_folder: Path) -> list[str]:
+    """A sentence for each folder of a run that was removed, or moved, since its nodes have begun.
+
+    What nodes write later makes folders again, so their files tell it.
+    """
+    names = [file.node.name for file in files]
+    gone = [name for name in names if _is_gone(run_folder / name / "node.json")]
+    folders = [run_folder] if gone == names else [run_folder / name for name in gone]
+    return [
+        f"{folder} was removed while the run went on: what was written there before is lost"
+        for folder in folders
+    ]
+
+
+def _is_gone(file: Path) -> bool:
+    try:
+        file.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:  # a node may have shut its folder
+        return False
+    return False
+
+
 def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
     """Write the expanded project and one ``node.json`` per node.
 
