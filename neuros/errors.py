@@ -31,20 +31,22 @@ if TYPE_CHECKING:
 _Result = TypeVar("_Result")
 
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+_NO_COLOUR = re.compile(r"[\x00-\x08\x0b-\x1a\x1c-\x1f\x7f-\x9f]|\x1b(?!\[[0-9;:]*m)")
 
 
 class NeurosError(Exception):
     """Base of all errors that NeuROS raises on purpose; its text is written for the user."""
 
 
-def printable(text: str) -> str:
+def printable(text: str, *, keeps_colours: bool = False) -> str:
     r"""A text that can be written as UTF-8, and does nothing to a terminal.
 
     Half a character, as ``'\udc80'``, is spelt out, and so are escape sequences and other control
     characters: names in a project may hold them.
     """
     text = text.encode("utf-8", "backslashreplace").decode()
-    return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
+    control = _NO_COLOUR if keeps_colours else _CONTROL
+    return control.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
 
 
 @dataclass(frozen=True, order=True)

@@ -483,7 +483,7 @@ class Console:
         self._translate = translate
         self._layout = os.environ.get("RCUTILS_CONSOLE_OUTPUT_FORMAT", LAYOUT)
         colours = stream is not None and wants_colours(stream, os.environ)
-        self._tail = LogTail({} if stream is None else logs, self.write, colours)
+        self._tail = LogTail({} if stream is None else logs, self._show, colours)
         self._line = ProgressLine(stream, shows_progress, lambda text: self.log("INFO", text))
         self._is_enough = is_enough
         self._is_finishing = False
@@ -495,7 +495,10 @@ class Console:
         return self._writer.failure
 
     def write(self, text: str) -> None:
-        """Write as it is, but for the names of paths."""
+        """Write what does nothing to a terminal, with the names of paths that the user knows."""
+        self._show(printable(text))
+
+    def _show(self, text: str) -> None:
         self._writer.write(self._line.around(self._translate(text)))
         if self._is_finishing:
             self._writer.finish(self._is_enough, self._patience_s)
@@ -503,7 +506,7 @@ class Console:
     def log(self, severity: str, text: str) -> None:
         """Write a record of the launcher itself, after what nodes have logged so far."""
         self.poll()
-        self.write(format_record(severity, "neuros", printable(text), layout=self._layout) + "\n")
+        self.write(format_record(severity, "neuros", text, layout=self._layout) + "\n")
 
     def follow(self, progress: Progress) -> None:
         """Show how far the run has come."""

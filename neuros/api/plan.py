@@ -18,7 +18,7 @@ from neuros.backends.pythons import Pythons, require_one_python
 from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
 from neuros.distribution import install_command
-from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
+from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError, printable
 from neuros.installation.progress import Progress, Stream
 from neuros.messages.needed import Messages
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Notice
@@ -295,7 +295,8 @@ def _check_deployment(request: Request) -> None:
 
 def _say(severity: str, text: str) -> None:
     """What is going on on other machines, before there is a console."""
-    print(f"neuros: {'' if severity == 'INFO' else 'warning: '}{text}", file=sys.stderr, flush=True)
+    mark = "" if severity == "INFO" else "warning: "
+    print(f"neuros: {mark}{printable(text)}", file=sys.stderr, flush=True)
 
 
 def _check_folder(folder: Path) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.api.request import ProjectOptions
-from neuros.errors import Problem, UsageError, printable
+from neuros.errors import Problem, UsageError
 from neuros.options import add_options, options_of
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ def load_with_messages(
 def show_warnings(warnings: Iterable[Problem]) -> None:
     """Write them to standard error."""
     for warning in warnings:
-        print(f"warning: {printable(str(warning))}", file=sys.stderr)
+        print(f"warning: {warning}", file=sys.stderr)
 
 
 def load_quietly(

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 from neuros.api.request import FORMS, ExportOptions, LaunchOptions, Request, SweepOptions
 from neuros.cli import EXIT_CODES
 from neuros.cli.common import JSON, add_format, add_project, load_with_messages, print_json
-from neuros.errors import EnvironmentFault, NeurosError, UsageError, printable
+from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.options import add_options, options_of, parsed_as, values_of
 from neuros.registry import AUTO, BACK_ENDS
 
@@ -193,7 +193,7 @@ def _dry_run(plan: Plan) -> int:
         *(notice for _, notice in plan.notices),
         *plan.launcher().describe(plan.node_files(folders_of(plan, folder))),
     ):
-        print(printable(line))
+        print(line)
     if recording is not None:
         names = ", ".join([*(topic.name for topic in recording.topics), *recording.listen])
         print(f"recorder: {names or 'nothing'} ({recording.storage})")
@@ -265,7 +265,7 @@ def _sweep(parsed: argparse.Namespace) -> int:
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
     """What may be a mistake in the project, without the line of Python that found it."""
-    print(f"warning: {printable(str(message))}", file=sys.stderr)
+    print(f"warning: {message}", file=sys.stderr)
 
 
 def _say_row(stream: TextIO, number: int, count: int, row: Mapping[str, Any]) -> None:

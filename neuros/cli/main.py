@@ -18,8 +18,9 @@ from importlib import import_module
 from typing import Any, NamedTuple, NoReturn
 
 from neuros.cli import EXIT_CODES
+from neuros.cli.terminal import harmless_output
 from neuros.distribution import __version__
-from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError, printable
+from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 from neuros.options import positive_number
 from neuros.ordinary_files import cannot_be_opened
 from neuros.project.suggest import counted, did_you_mean, listed
@@ -41,6 +42,11 @@ class Command(NamedTuple):
 
     module: str
     help: str = ""
+
+    @property
+    def is_for_people(self) -> bool:
+        """Whether its output goes to a terminal; that of others goes to a log, or a program."""
+        return bool(self.help) or self.module in ("replay", "launch")
 
     def add_to(self, commands: Any, name: str, *, is_whole: bool) -> None:
         """Add it to the parser; ``is_whole``: with its options."""
@@ -180,6 +186,14 @@ def main(arguments: Sequence[str]) -> int:
     if "_ARGCOMPLETE" in os.environ:  # a shell asks what fits: this ends the process
         _complete(os.environ.get("COMP_LINE", ""))
     _open_standard_streams()
+    command = COMMANDS.get(_command_in(arguments))
+    if command is not None and not command.is_for_people:
+        return _main(arguments)
+    with harmless_output():
+        return _main(arguments)
+
+
+def _main(arguments: Sequence[str]) -> int:
     # As in nodes. On its import NumPy would start threads, which spin for 50 ms.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not arguments:
@@ -289,7 +303,7 @@ def _give_up_output() -> None:
 
 def _complain(text: str) -> None:
     with contextlib.suppress(OSError):  # its reader has gone
-        print(printable(text), file=sys.stderr)
+        print(text, file=sys.stderr)
 
 
 def _open_standard_streams() -> None:

@@ -24,7 +24,7 @@ from neuros.cli.common import (
     show_warnings,
 )
 from neuros.distribution import EXAMPLES, PACKAGE
-from neuros.errors import NeurosError, ProjectError, UsageError, printable
+from neuros.errors import NeurosError, ProjectError, UsageError
 from neuros.project.suggest import counted, did_you_mean
 
 if TYPE_CHECKING:
@@ -70,11 +70,11 @@ def _validate(parsed: argparse.Namespace) -> int:
         print_json({"is_valid": True, "problems": [], "loops": loops})
         return 0
     print(
-        f"{printable(str(project.file))}: valid: {counted(len(project.nodes), 'node')},"
+        f"{project.file}: valid: {counted(len(project.nodes), 'node')},"
         f" {counted(len(project.connections), 'connection')}"
     )
     for loop in loops:
-        print(printable(str(loop)))
+        print(loop)
     return 0
 
 
