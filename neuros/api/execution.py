@@ -18,6 +18,7 @@ from neuros.analysis.run_record import broken_budgets, losses, run_record, run_t
 from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
 from neuros.api.run_folder import (
+    LAUNCHER_LOG,
     Recording,
     log_of,
     make_run_folder,
@@ -45,6 +46,7 @@ from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
 from neuros.options import recorded_values
+from neuros.ordinary_files import open_log
 from neuros.recording.recording_plan import RecordingPlan
 from neuros.recording.run_file import RUN_FILE, write_run_file
 from neuros.viewers.viewer import Shown, Views
@@ -108,6 +110,7 @@ class Execution:
         self._console = Console(
             stream,
             self._logs,
+            self.folder / LAUNCHER_LOG,
             lambda: bool(signals),
             self._as_here,
             shows_progress=plan.request.progress,
@@ -465,6 +468,7 @@ class Console:
     Args:
         stream: where to write, ``None``: nowhere.
         logs: the log files to show, by name.
+        log_file: that of the launcher, for what is too long to be shown.
         is_enough: whether the user wants no more of it (asked while it waits).
         translate: from what nodes say to what the user knows (names of paths).
         shows_progress: whether to show how far the run has come; ``None``: if its end is known.
@@ -474,12 +478,14 @@ class Console:
         self,
         stream: TextIO | None,
         logs: Mapping[str, Path],
+        log_file: Path,
         is_enough: Callable[[], bool],
         translate: Callable[[str], str] = str,
         *,
         shows_progress: bool | None = None,
     ) -> None:
         self._writer = NonBlockingWriter(stream)
+        self._log_file = log_file
         self._translate = translate
         self._layout = os.environ.get("RCUTILS_CONSOLE_OUTPUT_FORMAT", LAYOUT)
         colours = stream is not None and wants_colours(stream, os.environ)
@@ -504,9 +510,19 @@ class Console:
             self._writer.finish(self._is_enough, self._patience_s)
 
     def log(self, severity: str, text: str) -> None:
-        """Write a record of the launcher itself, after what nodes have logged so far."""
+        """Write a record of the launcher itself, after what nodes have logged so far.
+
+        One of severity ``DEBUG`` goes to the log of the launcher only.
+        """
+        if severity == "DEBUG":
+            self._keep(format_record(severity, "neuros", text))
+            return
         self.poll()
         self.write(format_record(severity, "neuros", text, layout=self._layout) + "\n")
+
+    def _keep(self, record: str) -> None:
+        with contextlib.suppress(OSError), open_log(self._log_file) as log:
+            log.write(f"{record}\n".encode(errors="backslashreplace"))
 
     def follow(self, progress: Progress) -> None:
         """Show how far the run has come."""

@@ -5,6 +5,7 @@
     runs/<project>/<utc time>/     or exactly what -o names
         project.json               the expanded project
         run.json                   how the run went
+        launcher.log               stacks that are too long for the console
         <node>/node.json           what the node was told
         <node>/node.log            what it printed and logged
         <node>/...                 what its plugin wrote to node.run_dir
@@ -34,6 +35,8 @@ from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_text, project_to_json
 from neuros.recording.provenance import seeds
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, plan_recording
+
+LAUNCHER_LOG = "launcher.log"
 
 
 def run_folder_path(

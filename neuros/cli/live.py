@@ -468,6 +468,7 @@ def _logs(options: argparse.Namespace) -> int:
         files = {name: files[name] for name in options.nodes}
     else:
         files |= {"neuros": folder / PROCESS_LOG, "recorder": folder / "recorder.log"}
+        files["launcher"] = folder / "launcher.log"
     colours = wants_colours(sys.stdout, os.environ)
     with LogTail(files, lambda text: print(text, end="", flush=True), colours) as tail:
         while options.follow and session is not None and session.is_led:

@@ -25,6 +25,7 @@ SIGNAL_NAMES = {
 class Output(Protocol):
     """Output of the supervisor for people; neither call may wait for a reader.
 
+    Records of severity ``DEBUG`` are kept, and not shown.
     ``poll`` shows what nodes have logged since; it returns whether that was anything.
     """
 

@@ -197,6 +197,8 @@ class StallDetector:
     ) -> Iterator[tuple[str, str]]:
         """Processes that do not report, each once, and where they stand; not if they were killed.
 
+        One that still imports only informs, and its stack is for the log.
+
         A process is read beside; the remark comes when that is there.
         """
         for name, heard_s in self._heard_s.items():
@@ -208,8 +210,28 @@ class StallDetector:
             if read is None and now_s - heard_s < LONG_S + _READ_WITHIN_S:
                 continue
             self._named_as_mute.update(names)
-            if remark := self._remark_on(names, read or _NOT_IN_TIME):
+            read = read or _NOT_IN_TIME
+            if remark := self._remark_on_import(names, read):
+                yield "INFO", remark
+            elif remark := self._remark_on(names, read):
                 yield "WARN", remark
+
+    def _remark_on_import(self, names: Sequence[str], read: ProcessThreads) -> str:
+        """What a process does whose main thread lets no other run before its nodes have begun."""
+        holder = read.lock_holder
+        loading = [n for n in names if n not in self._loaded and not self.has_begun(n)]
+        stacks = filter(None, map(self._read_stack, names))
+        if not (holder and holder.is_main and loading) or read.stopped:
+            return ""
+        if any(stack.hook != IMPORT for stack in stacks):
+            return ""
+        what = "has been importing its plugin"
+        if len(loading) > 1:
+            what = "have been importing their plugins"
+        return (
+            f"{', '.join(loading)} {what} for {LONG_S:g} s, and cannot report: a library that is"
+            f" loaded lets no other thread run (where it stands is in launcher.log)\n{holder}"
+        )
 
     def _remark_on(self, names: Sequence[str], read: ProcessThreads) -> str:
         """Why a process with these nodes does not report; empty if that has been said."""
@@ -220,8 +242,6 @@ class StallDetector:
                     return ""
                 self._named_as_held.add(stack.node)
                 does = f"executing '{stack.hook}'"
-                if stack.hook == IMPORT:
-                    does = "importing its plugin"
                 said = f"{stack.node} has been {does} for {LONG_S:g} s, and cannot report"
                 return with_stack(f"{said}: a library holds Python's global lock", stack)
         have = "has" if len(names) == 1 else "have"

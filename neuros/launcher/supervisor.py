@@ -346,7 +346,10 @@ class Supervisor:
 
     def _show(self, remarks: Iterable[tuple[str, str]]) -> None:
         for severity, text in remarks:
-            self._output.log(severity, text)
+            line, _, stack = text.partition("\n") if severity == "INFO" else (text, "", "")
+            self._output.log(severity, line)
+            if stack:
+                self._output.log("DEBUG", f"{line}\n{stack}")
 
     def _keep_pause(self) -> None:
         """Note how long the run has stood still; nodes that are stopped meanwhile do not go on."""

@@ -336,8 +336,23 @@ def test_a_plugin_whose_import_keeps_the_lock_is_named() -> None:
     reader = reader_of(ProcessThreads((held,)))
     detector = StallDetector(["a"], 0.0, reader)
     detector.greet(["a"], {"a": "/a.py"}, 1.0)
+    ((severity, text),) = detector.remarks_on_silence(6.0)
+    line, _, stack = text.partition("\n")
+    assert severity == "INFO"
+    assert line == (
+        "a has been importing its plugin for 5 s, and cannot report: a library that is loaded lets"
+        " no other thread run (where it stands is in launcher.log)"
+    )
+    assert '"/a.py", line 1, in <module>' in stack
+
+
+def test_so_is_one_that_has_not_come_to_its_plugin_yet() -> None:
+    frames = (("/lib/importlib.py", 1, "exec_module"), ("/lib/rclpy.py", 1, "<module>"))
+    held = Thread("MainThread", is_main=True, has_lock=True, frames=frames)
+    detector = StallDetector(["a", "b"], 0.0, reader_of(ProcessThreads((held,))))
+    detector.greet(["a", "b"], {"a": "/a.py", "b": "/b.py"}, 1.0)
     (text,) = silence(detector, 6.0)
-    assert text.startswith("a has been importing its plugin for 5 s, and cannot report: a library")
+    assert text.startswith("a, b have been importing their plugins for 5 s, and cannot report")
 
 
 def test_nodes_of_one_plugin_are_each_named_in_processes_of_their_own() -> None:
