@@ -253,6 +253,8 @@ def test_a_recorded_run_without_a_packet_log_can_be_replayed(tmp_path: Path) -> 
     replayed = replay(tmp_path / "run", "a")
     assert replayed.returncode == 0, replayed.stderr
     assert f"{TICKS} packets" in replayed.stdout
+
+
 SERVER = """
 from neuros.hooks import neuros_initialise
 
