@@ -15,8 +15,6 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cache, wraps
 from typing import Any
 
-import numpy
-
 from neuros.errors import WrongValue
 from neuros.transport.schema import Field, Shape, Sort, schema
 from neuros.transport.values import (
@@ -106,6 +104,8 @@ def _to_sequence(field: Field) -> Convert:
 
 def _to_array(field: Field) -> Convert:
     """A function that makes an array of NumPy, of matrices, too: their shape is kept."""
+    import numpy  # here: most messages have no such field, and the import takes 70 ms
+
     code, to_numbers = field.type.code, numbers_converter(field)
     dtype = numpy.dtype(code)
 
@@ -131,7 +131,9 @@ def _unchanged(code: str, values: Sequence[Any]) -> array[Any] | None:
         return None
 
 
-def _view_of(field: Field) -> Callable[[Any], FieldArray]:
+def _view_of(field: Field) -> Callable[[Any], Any]:
+    import numpy
+
     slot, name, is_double = field.slot, field.slot[1:], field.type.code == "d"
     to_array, to_number = _to_array(field), single_converter(field.type)
 
@@ -141,7 +143,7 @@ def _view_of(field: Field) -> Callable[[Any], FieldArray]:
 
     converted = _refusing(name, convert)
 
-    class View(FieldArray):
+    class View(_field_array()):  # type: ignore[misc]
         def __setitem__(self, place: Any, value: Any) -> None:
             # Parts of the field have a base; a copy is the plugin's own.
             if not (is_double and type(value) is float) and self.base is not None:
@@ -151,15 +153,21 @@ def _view_of(field: Field) -> Callable[[Any], FieldArray]:
     return lambda message: getattr(message, slot).view(View)
 
 
-class FieldArray(numpy.ndarray):
-    """A view of the numbers in a field with a fixed number of them; it is what plugins see."""
+@cache
+def _field_array() -> Any:
+    import numpy
 
-    def __array_wrap__(self, made: Any, *_: Any) -> Any:
-        """What a plugin computes from it is an array like any other, or a number."""
-        return numpy.asarray(made)[()]
+    class FieldArray(numpy.ndarray):
+        """A view of the numbers in a field with a fixed number of them; what plugins see."""
 
-    def __repr__(self) -> str:
-        return repr(self.view(numpy.ndarray))
+        def __array_wrap__(self, made: Any, *_: Any) -> Any:
+            """What a plugin computes from it is an array like any other, or a number."""
+            return numpy.asarray(made)[()]
 
-    def __reduce__(self) -> Any:
-        return self.view(numpy.ndarray).__reduce__()
+        def __repr__(self) -> str:
+            return repr(self.view(numpy.ndarray))
+
+        def __reduce__(self) -> Any:
+            return self.view(numpy.ndarray).__reduce__()
+
+    return FieldArray
