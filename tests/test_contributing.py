@@ -36,7 +36,8 @@ class Checkout:
         self.changed: set[str] = set()
         skipped = shutil.ignore_patterns("__pycache__", "static")
         shutil.copytree(ROOT / "neuros", folder / "neuros", ignore=skipped, symlinks=True)
-        shutil.copytree(ROOT / "schema", folder / "schema")
+        for name in ("schema", "containers"):
+            shutil.copytree(ROOT / name, folder / name)
 
     def insert(self, file: str, before: str, text: str) -> None:
         """Put text into a file, before another one that is there once."""

@@ -141,7 +141,7 @@ def find_uv(python: Path) -> Path | None:
 
 
 def make_venv(command: Sequence[str], environ: Mapping[str, str]) -> str:
-    """Run ``python -m venv``; returns why it failed, and what to do, or an empty text."""
+    """Run the command that makes a virtual environment; returns why it failed, or nothing."""
     python, made = command[0], answer_of(command, clean_environment(environ))
     if made is None or not made.returncode:
         return "" if made else f"{python} cannot be started"

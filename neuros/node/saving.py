@@ -29,14 +29,14 @@ class Saving:
             return False
         return any(each not in self._before for each in self._open_files())
 
-    def _open_files(self) -> Iterator[tuple[str, str]]:
-        """Number and path of what is open for writing."""
+    def _open_files(self) -> Iterator[Path]:
+        """What is open for writing."""
         for number in os.listdir("/proc/self/fd"):
             try:
-                path = os.readlink(f"/proc/self/fd/{number}")
+                path = Path(os.readlink(f"/proc/self/fd/{number}"))
                 info = Path(f"/proc/self/fdinfo/{number}").read_text("ascii")
             except OSError:  # closed meanwhile, this listing itself among them
                 continue
             flags = int(info.split("flags:", 1)[1].split(None, 1)[0], 8)
-            if flags & os.O_ACCMODE != os.O_RDONLY and Path(path).is_relative_to(self._folder):
-                yield number, path
+            if flags & os.O_ACCMODE != os.O_RDONLY and path.is_relative_to(self._folder):
+                yield path
