@@ -44,6 +44,7 @@ class Finalising:
         """The nodes have been told to end."""
         for name in self.limits_s:
             self._moved_s.setdefault(name, now_s)
+            self._looked_s.setdefault(name, now_s)  # what nodes write as they are told is no news
 
     def excuse(self, still_s: float) -> None:
         """The run stood still for so long."""

@@ -205,7 +205,7 @@ class NodeProcess:
     def report(self) -> None:
         """Report state and counters of all nodes. Any thread."""
         for node in tuple(self._nodes):
-            if self._saving is None:  # else a log that grows would pass for progress of the plugin
+            if not self.is_ending:  # else a log that grows would pass for progress of the plugin
                 node.reports.write_logs()
             self._tell(node.reports.report())
         if self._saving is not None:
