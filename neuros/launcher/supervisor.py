@@ -343,6 +343,8 @@ class Supervisor:
             self._paused_before_s = self.pause.total_s
             self._shutdown.end_of_start()  # hooks that send unasked would start before it
             self._channels.send(control.Activate())
+            self._detector.begin_anew(now_s)  # until now nothing else could move
+            self._backlog.begin_anew()
 
     def _show(self, remarks: Iterable[tuple[str, str]]) -> None:
         for severity, text in remarks:

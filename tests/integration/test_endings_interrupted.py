@@ -245,11 +245,12 @@ KEEPS_FROM_BEGINNING = """
 import sys
 from pathlib import Path
 from neuros.cli.main import main
-from neuros.launcher.shutdown import Shutdown
-def let_begin(self, names):
-    Path("loaded").touch()
+from neuros.launcher.start import Start
+def may_initialise(self):
+    if self._loaded >= self._names:
+        Path("loaded").touch()
     return False
-Shutdown.let_begin = let_begin
+Start.may_initialise = may_initialise
 sys.exit(main(["launch", *sys.argv[1:]]))
 """
 
@@ -290,7 +291,7 @@ def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(benc
         "b.o -> c.x",
         "d.o -> c.y",
         **(holds if bench.back_end == "process" else {}),
-        a="@neuros_initialise(outputs='o')\ndef think(node):\n"
+        a="@neuros_tick(seconds=0.1, outputs='o')\ndef think(node):\n"
         "    time.sleep(6.5)\n    return node.make_packet('o')\n",
         b=RELAY,
         c=SINK.replace("inputs='x'", "inputs=['x', 'y']").replace("x)", "x, y=None)"),
@@ -316,6 +317,20 @@ def test_a_standstill_is_explained_and_a_long_hook_named_after_five_seconds(benc
         assert not any(text.startswith("a executes") for text in said), "that was said before"
     else:
         assert not any(" waits for " in text for text in said), "all wait for that hook"
+
+
+def test_until_every_node_has_initialised_the_others_are_said_to_wait(bench: Bench) -> None:
+    thinks = "@neuros_initialise()\ndef think(node):\n    time.sleep(6.5)\n"
+    bench.project("a.o -> b.x", a=SOURCE + thinks, b=SINK + RUNS)
+    running = bench.start("--duration", "0.5")
+    waiting = "a" if bench.back_end == "process" else "a, b"  # in process b has its turn later
+    running.wait_for(f"still initialising: {waiting}\n", 20.0)
+    running.wait_for("a has been executing 'think' for 5 s", 3.0)
+    assert "[b]: running" not in running.output
+    finished = running.finish(GONE_WITHIN_S + 5.0)
+    assert_ended(finished, 0, "0.5 s are over")
+    assert "[b]: running" in finished.output
+    assert not any(" waits " in text for text in finished.said("neuros")), "all wait for a"
 
 
 def test_waiting_connections_are_named_after_five_seconds(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ def save(node):
     (node.run_dir / "saved").touch()
 """
 HOLDS_THE_GIL = f"""
-@neuros_initialise()
+@neuros_function()
 def hold(node):
     node.get_logger().info("running")
     {KEEP_THE_GIL}
