@@ -11,6 +11,8 @@ The rules by name, as :class:`Violation` has them:
 =================  ============================================================================
 ``single thread``  hooks of a node never overlap, nor any two hooks in process
 ``initialise``     each initialise hook once, before all others
+``start``          no hook before every plugin is loaded; no tick or function hook of any node
+                   before every initialise hook of nodes that need no packets for it has ended
 ``finalise``       each finalise hook once, after all others
 ``input``          a required input has a packet; the packets of an ``All`` input are in order
 ``content``        a packet arrives as it was sent, from a source of that input, after it was sent
@@ -40,7 +42,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from .description import Connection, Hook, Node, Project, Taken
-from .running import Execution, Observed
+from .running import Execution, Observed, earliest_start_ns
 
 TIMED = {
     "window",
@@ -143,6 +145,8 @@ class Judge:
             name: _Busy(e for other, log in self.log.items() if other != name for e in log)
             for name in (self.log if self.is_one_process else ())
         }
+        self.earliest_ns = earliest_start_ns(project, observed)
+        self.latest_ns = self._latest_start()
         self.begin_ns = {node.name: self._begin(node) for node in project.nodes}
         self._found: list[Violation] = []
         self.intakes: dict[tuple[str, str, Connection], _Intake] = {}
@@ -187,7 +191,12 @@ class Judge:
 
     @property
     def _unbegun(self) -> set[str]:
-        """Nodes that were still being loaded when the project ended: they never said a word."""
+        """Nodes that were still being loaded when the project ended: they never said a word.
+
+        An end that is drained waits for them.
+        """
+        if self.seen.exit_code == 0:
+            return set()
         nodes = self.seen.record.get("nodes", {})
         return {
             name
@@ -218,15 +227,21 @@ class Judge:
 
     # ------------------------------------------------------------------ reading
 
+    def _latest_start(self) -> int:
+        """Time 0 of the run, or after: a tick comes a period later; ``_NEVER``: nobody knows."""
+        times = [
+            log[0].start_ns - int(hook.seconds * 1e9 if hook.kind == "tick" else 0)
+            for (node, name), hook in self.hooks.items()
+            if hook.kind in ("tick", "function") and (log := self.runs[node, name])
+        ]
+        return max(min(times), self.earliest_ns) if times else _NEVER
+
     def _begin(self, node: Node) -> int:
         """When a node had certainly begun to run, ``_NEVER`` if that is not known."""
-        log = [each for each in self.log[node.name]
-               if self.hooks[node.name, each.hook].kind != "finalise"]  # fmt: skip
-        initialisers = [hook.name for hook in node.hooks if hook.kind == "initialise"]
-        if initialisers:
-            done = [self.runs[node.name, name] for name in initialisers]
-            return max(log[0].end_ns for log in done) if all(done) else _NEVER
-        return log[0].start_ns if log else _NEVER
+        done = [self.runs[node.name, hook.name] for hook in node.hooks if hook.kind == "initialise"]
+        if not all(done):
+            return _NEVER
+        return max([self.latest_ns, *(log[0].end_ns for log in done)])
 
     def _feeding(self, node: Node, hook: Hook) -> list[Connection]:
         return [c for each in hook.inputs for c in self.project.sources(node.name, each.port)]
@@ -322,6 +337,14 @@ class Judge:
                     )
 
     def _phases(self) -> Iterator[Violation]:
+        loaded_ns = max(self.seen.loaded_ns.values(), default=_NEVER)
+        for (node_name, name), log in self.runs.items():
+            kind = self.hooks[node_name, name].kind
+            due_ns = {"initialise": loaded_ns, "finalise": _ALWAYS}.get(kind, self.earliest_ns)
+            if log and log[0].start_ns < due_ns:
+                early_ms = (due_ns - log[0].start_ns) / 1e6
+                text = f"{node_name}.{name} ran {early_ms:.1f} ms before every node was ready"
+                yield Violation("start", text)
         for node in self.project.nodes:
             log = self.log[node.name]
             kinds = [self.hooks[node.name, each.hook].kind for each in log]
@@ -625,19 +648,20 @@ class Judge:
         if not starts:
             return
         period_ns = int(hook.seconds * 1e9)
-        has_initialisers = any(each.kind == "initialise" for each in node.hooks)
-        begin_ns = self.begin_ns[node.name]
-        if has_initialisers and starts[0] < begin_ns + period_ns:
+        early_ns, late_ns = self._since(node)
+        if starts[0] < early_ns + period_ns:
             yield Violation("tick", f"{node.name}.{hook.name} ran before its first due time")
         # Some phase has a due time between each two starts. A note is made a moment after a start,
         # and later still where the machine does something else just then.
         slack_ns = period_ns // 4
         pairs = [(a - slack_ns, b) for a, b in itertools.pairwise(starts) if b - a < period_ns]
-        candidates = {b % period_ns for _, b in pairs}
-        if has_initialisers:
-            late_ns = _TICK_START_NS + self.seen.late_ns
-            candidates = {p for p in candidates if (p - begin_ns) % period_ns <= late_ns}
-            candidates.add((begin_ns + late_ns) % period_ns)
+        late_ns += _TICK_START_NS + self.seen.late_ns
+        candidates = {
+            phase
+            for phase in (b % period_ns for _, b in pairs)
+            if (phase - early_ns) % period_ns <= late_ns - early_ns
+        }
+        candidates.add(late_ns % period_ns)
         early = min(
             (
                 sum((b - phase) // period_ns == (a - phase) // period_ns for a, b in pairs)
@@ -650,17 +674,25 @@ class Judge:
             yield Violation("tick", text)
         yield from self._missed_ticks(node, hook, starts)
 
+    def _since(self, node: Node) -> tuple[int, int]:
+        """Between which times the start lies from which ticks of a node are counted."""
+        latest_ns = self.begin_ns[node.name]
+        own = [each.end_ns for each in self.log[node.name]
+               if self.hooks[node.name, each.hook].kind == "initialise"]  # fmt: skip
+        return max([self.earliest_ns, *own]), latest_ns
+
     def _missed_ticks(self, node: Node, hook: Hook, starts: Sequence[int]) -> Iterator[Violation]:
         """Due times up to the last start are executions or counted as missed: no drift."""
         books = self.seen.record.get("nodes", {}).get(node.name, {}).get("hooks", {}).get(hook.name)
-        begin_ns = self.begin_ns[node.name]
-        if not books or begin_ns == _NEVER or not any(h.kind == "initialise" for h in node.hooks):
+        early_ns, late_ns = self._since(node)
+        if not books or late_ns == _NEVER:
             return
         period_ns = int(hook.seconds * 1e9)
-        due = (starts[-1] - begin_ns) // period_ns
+        least = (starts[-1] - late_ns) // period_ns
+        due = (starts[-1] - early_ns) // period_ns
         slack = 1 + (_TICK_START_NS + self.seen.late_ns) // period_ns
         counted = books["executions"] + books["missed_ticks"]
-        if not due - slack <= counted <= due + 1:
+        if not least - slack <= counted <= due + 1:
             yield Violation(
                 "tick",
                 f"{node.name}.{hook.name}: {books['executions']} executions and"
@@ -813,6 +845,8 @@ class Judge:
                 continue
             # A hook may run, and the launcher be slow to hear of the first one.
             late_ns = 10 * self.tolerance_ns + self._longest_ns(node)
+            if self.latest_ns != _NEVER:  # a duration is counted from between these two
+                late_ns += self.latest_ns - self.earliest_ns
             for each in log:
                 if each.start_ns > self.end_ns + late_ns:
                     late_s = (each.start_ns - self.end_ns) / 1e9

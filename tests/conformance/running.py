@@ -153,28 +153,26 @@ def run_in(
     observed.late_ns = meter.worst_ns(begin_ns)
     observed.left = _left(run_folder)
     _read(run_folder, project, observed)
-    if duration and observed.ending_ns is None and (first := _first_ns(observed)) is not None:
-        observed.ending_ns = first + int(duration * 1e9)
+    if duration and observed.ending_ns is None:
+        observed.ending_ns = earliest_start_ns(project, observed) + int(duration * 1e9)
     return observed
 
 
 def _wait(
     live: LiveRun, project: Project, run_folder: Path, seconds: float, observed: Observed
 ) -> None:
-    """Until it has ended, by itself or since it was interrupted in time.
+    """Until it has ended, by itself or since it was interrupted some time after its first hook.
 
-    A duration counts from the first hook. Where none can start before an external topic brings
-    something, and so perhaps never, it is interrupted, too.
+    That hook may wait for an external topic to bring something, and so perhaps for ever.
     """
     deadline_s = time.monotonic() + LONGEST_S
-    patience_s = _UNBEGUN_S if any(c.is_external for c in project.all_connections) else LONGEST_S
-    unbegun_s = time.monotonic() + patience_s
-    while live.is_running and time.monotonic() < unbegun_s and not _has_begun(run_folder):
-        time.sleep(_POLL_S)
-    is_interrupted = project.end == "interrupt" or not _has_begun(run_folder)
-    if is_interrupted and not _has_ended(live, seconds):
-        observed.ending_ns = time.monotonic_ns()
-        live.interrupt()
+    if project.end == "interrupt":
+        unbegun_s = time.monotonic() + _UNBEGUN_S
+        while live.is_running and time.monotonic() < unbegun_s and not _has_begun(run_folder):
+            time.sleep(_POLL_S)
+        if not _has_ended(live, seconds):
+            observed.ending_ns = time.monotonic_ns()
+            live.interrupt()
     if not _has_ended(live, max(_PATIENCE_S, deadline_s - time.monotonic())):
         observed.is_overdue = True
         observed.ending_ns = observed.ending_ns or time.monotonic_ns()
@@ -213,8 +211,18 @@ def _read(run_folder: Path, project: Project, observed: Observed) -> None:
                 observed.loaded_ns[node.name] = start_ns
 
 
-def _first_ns(observed: Observed) -> int | None:
-    return min((log[0].start_ns for log in observed.executions.values() if log), default=None)
+def earliest_start_ns(project: Project, observed: Observed) -> int:
+    """Time 0 of the run, or before: by then every node is loaded, and has initialised.
+
+    A node whose initialise hooks take packets may need those of others for that.
+    """
+    times = [*observed.loaded_ns.values()]
+    for name, log in observed.executions.items():
+        hooks = [hook for hook in project.by_name[name].hooks if hook.kind == "initialise"]
+        if not any(hook.inputs for hook in hooks):
+            names = {hook.name for hook in hooks}
+            times += [each.end_ns for each in log if each.hook in names]
+    return max(times, default=0)
 
 
 def _left(run_folder: Path) -> list[str]:

@@ -23,7 +23,7 @@ class Story:
         self.project = project
         self.seen = Observed(backend, ended_ns=0, ending_ns=1000 * MS)
         self.seen.executions = {node.name: [] for node in project.nodes}
-        self.seen.loaded_ns = {node.name: -1 for node in project.nodes}
+        self.seen.loaded_ns = {node.name: -100 * MS for node in project.nodes}
         self.numbers: dict[str, int] = {}
         self.exit_code, self.reason = 0, "1 s are over"
         self.books: dict[str, dict[str, Any]] = {}
@@ -259,13 +259,51 @@ def test_ticks_that_come_too_often():
 
 def test_ticks_that_drift():
     """Each is counted from the last one, which was 30 ms late, and none as missed."""
-    assert "tick" in ticking(*(10 + 130 * k for k in range(1, 8))).rules()
+    assert "tick" in ticking(*(10 + 130 * k for k in range(1, 15))).rules()
 
 
 def test_initialise_hooks_that_run_late_or_twice():
     for at_ms in (50, 250):
         story = ticking(*(10 + 100 * k for k in range(1, 11)))
         assert "initialise" in story.run("a.first", at_ms).rules()
+
+
+def started(at_ms: float, *, begins: Sequence[Packet] | None = None) -> Story:
+    """``b`` loads for 100 ms and initialises for 50 ms, then ``a`` sends its first packet.
+
+    ``begins``: what the initialise hook of ``b`` takes, if it takes packets.
+    """
+    inputs = () if begins is None else (Taken("x"),)
+    story = Story(pair(0, 1, Hook("first", "initialise", inputs)))
+    story.seen.loaded_ns["b"] = 100 * MS
+    story.run("a.send", at_ms)
+    story.run("b.first", 101, *[begins] * len(inputs), ms=50)
+    story.run("b.take", max(at_ms, 151) + 2, [("a.o", 1)])
+    story.seen.ending_ns = 153 * MS
+    return story
+
+
+def test_hooks_that_run_before_the_initialise_hooks_of_every_node_have_ended():
+    assert "start" in started(150).rules()
+    assert "start" not in started(172).rules()
+
+
+def test_initialise_hooks_that_run_before_every_plugin_is_loaded():
+    story = started(172)
+    story.seen.loaded_ns["a"] = 102 * MS
+    assert "start" in story.rules()
+
+
+def test_hooks_that_send_what_an_initialise_hook_waits_for_need_not_wait_for_its_end():
+    assert "start" not in started(120, begins=[("a.o", 1)]).rules()
+    assert "start" in started(99, begins=[("a.o", 1)]).rules()
+
+
+def test_a_node_that_was_never_let_begin_in_a_run_that_ended_well():
+    story = started(172)
+    story.close()
+    story.seen.executions["b"].clear()
+    assert "finalise" in {each.rule for each in judge(story.project, story.seen)}
 
 
 def test_finalise_hooks_that_run_twice_or_never():
