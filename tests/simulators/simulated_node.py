@@ -65,7 +65,11 @@ class Log:
 
 
 class SimulatedNode:
-    """What a simulator sees of its node. ``blocked`` holds submissions back."""
+    """What a simulator sees of its node. ``blocked`` holds submissions back.
+
+    Attributes:
+        is_active: whether every node is ready; before that, time 0 of the run is still to come.
+    """
 
     def __init__(
         self,
@@ -88,6 +92,7 @@ class SimulatedNode:
         self.log = Log()
         self.sent: list[dict[str, Any]] = []
         self.changed = threading.Condition()
+        self.is_active = True
         self.is_blocked = False
         self.is_waiting = False
         self.closers: list[Callable[[], None]] = []
@@ -129,6 +134,15 @@ class SimulatedNode:
         with self.changed:
             self.failures.append(error)
             self.changed.notify_all()
+
+    def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
+        with self.changed:
+            self.is_waiting = not self.is_active
+            self.changed.notify_all()
+            while not self.is_active and not cancelled():
+                self.changed.wait(0.01)
+            self.is_waiting = False
+            return self.is_active
 
     def submit(self, packets: Mapping[str, Any], cancelled: Callable[[], bool]) -> bool:
         with self.changed:

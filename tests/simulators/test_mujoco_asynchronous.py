@@ -65,6 +65,26 @@ def test_the_packets_are_those_of_the_synchronous_simulation(node):
         assert str(packets["imu"]) == str(reference.read("imu"))
 
 
+def test_it_stands_still_until_every_node_is_ready_and_then_begins_at_time_zero(node):
+    node.is_active = False
+    sim = MuJoCo(node, WORLD)
+    sim.run_asynchronous(None)
+    node.wait_until(lambda: node.is_waiting)
+    assert (sim.sim_time, node.sent) == (0.0, [])
+    node.is_active = True
+    node.wait_until(lambda: len(node.sent) >= 1)
+    assert stamp_ns(node.sent[0]["imu"]) == 20_000_000
+
+
+def test_it_can_be_stopped_before_every_node_is_ready(node):
+    node.is_active = False
+    sim = MuJoCo(node, WORLD)
+    sim.run_asynchronous(None)
+    node.wait_until(lambda: node.is_waiting)
+    sim.stop()
+    assert (sim.is_running, node.sent) == (False, [])
+
+
 def test_stepping_waits_while_a_connection_is_blocked(node):
     sim = MuJoCo(node, WORLD)
     node.block(True)
