@@ -16,6 +16,7 @@ import pytest
 from container_bench import HOLDS_THE_GIL, ContainerBench, container_bench
 from endings import GONE_WITHIN_S, RUNS
 from launching import EXAMPLES, Finished, Running, launch, start
+from starts import PLUGINS, assert_all_began_together
 from virtual_display import virtual_display
 
 from containers import require_containers, wait_until
@@ -338,6 +339,16 @@ def test_ctrl_c_ends_all_properly(bench: ContainerBench) -> None:
     assert finished.exit_code == 130
     assert bench.has_saved("a", "b")
     assert bench.left() == []
+
+
+def test_no_hook_runs_before_all_have_loaded_and_no_tick_before_all_have_initialised(
+    bench: ContainerBench,
+) -> None:
+    bench.project(PLUGINS)
+    finished = bench.launch("--duration", "0.5")
+    assert finished.exit_code == 0, finished.output
+    assert_all_began_together(bench.folder)
+    assert bench.has_saved(*PLUGINS)
 
 
 def test_nodes_that_cannot_end_are_killed(bench: ContainerBench) -> None:
