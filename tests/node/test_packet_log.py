@@ -32,6 +32,7 @@ def node() -> Any:
         send_windows={LEAVING: SendWindow(LEAVING)},
         subscriptions=subscriptions,
         execution_log=ExecutionLog(),
+        pauses=SimpleNamespace(still_ns=array("q")),
     )
 
 
@@ -124,7 +125,8 @@ def test_a_list_keeps_the_newest_packets_and_no_more_than_it_may(
 
 def test_in_a_recorded_run_a_list_keeps_the_first_packets(tmp_path: Path, node: Any) -> None:
     recorded = LoggedEngine.__new__(LoggedEngine)
-    vars(recorded).update(vars(node), event_log=array("q", [-1, -2, -3]))
+    parts = {"_pause" if name == "pauses" else name: part for name, part in vars(node).items()}
+    vars(recorded).update(parts, event_log=array("q", [-1, -2, -3]))
     log = PacketLog(recorded, {}, tmp_path, list_bytes=16)
     for time_ns in (1, 2, 3):
         node.send_windows[LEAVING].spend(time_ns)
