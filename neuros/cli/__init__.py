@@ -8,6 +8,7 @@ exit codes:
   3    invalid project: every problem is listed with its file and line
   4    something is missing on this machine, or a record could not be written
   5    the run broke a budget of its project
+  6    verify: the same packets were sent, but hooks took others of them
   130  ended by Ctrl+C (a second one kills at once)
   143  ended by SIGTERM, or because the terminal was closed
 """
