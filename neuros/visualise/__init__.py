@@ -6,7 +6,7 @@
 
     @neuros_initialise()
     def start(node):
-        figure = VisualiseRotations("Head direction")
+        figure = VisualiseRotations("Head direction", node=node)
         figure.add_quaternion("truth", "g")
         figure.add_degrees("estimate", "r")
         node.set_user_data(figure)
@@ -18,7 +18,8 @@
 A hook never waits for Matplotlib, which is not imported here: a message goes into a socket as far
 as that takes it, the rest with the next one. What the drawing process cannot take is kept, and left
 out and counted at last. With a display there is a window; in any case the figure is saved in the
-node's folder of the run, every ten seconds and at the end.
+node's folder of the run, every ten seconds and at the end. A figure that knows its ``node`` is
+saved then however busy the machine is.
 """
 
 from __future__ import annotations
@@ -36,10 +37,10 @@ import struct
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -59,12 +60,21 @@ _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
 _LONGEST_STEM = 60  # characters, of up to four bytes: a name may have 255
 _MOST_UNSENT_BYTES = 1 << 22
 _NICENESS = 5
-_PATIENCE_S = 30.0
-# A node has 5 s in all to end, with its finalise hooks before and on a busy machine.
+_PATIENCE_S = 60.0
+_TELL_S = 1.0
+# A process has 5 s to end, on a busy machine, too, and leaves ROS meanwhile.
 _PATIENCE_AT_END_S = 2.0
 _LENGTH = struct.Struct("!I")
 # The program needs no ROS: it must not start a second time to find its libraries.
 _ENVIRONMENT = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
+
+
+class _Node(Protocol):
+    """The ``node`` that hooks receive, as far as figures need it."""
+
+    def on_close(self, callback: Callable[[], None]) -> None: ...
+
+    def progress(self, text: str) -> None: ...
 
 
 class _Feed:
@@ -73,6 +83,7 @@ class _Feed:
     Args:
         first: the first message.
         file: where the figure is saved.
+        node: the figure is closed when it ends; ``None``: when the process does.
 
     Attributes:
         dropped: messages that were left out.
@@ -81,8 +92,9 @@ class _Feed:
         EnvironmentFault: if it cannot be started.
     """
 
-    def __init__(self, first: Sequence[Any], file: Path) -> None:
+    def __init__(self, first: Sequence[Any], file: Path, node: _Node | None) -> None:
         self.file = file
+        self._node = node
         self.dropped = 0
         self._sent = 0
         self._unsent = bytearray()
@@ -104,6 +116,8 @@ class _Feed:
         with contextlib.suppress(OSError):  # the node comes first
             os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICENESS)
         _OPEN.append(self)
+        if node is not None:
+            node.on_close(self.close)
         self.send(first)
 
     def send(self, message: Sequence[Any]) -> None:
@@ -128,22 +142,33 @@ class _Feed:
     def hang_up(self, deadline_s: float) -> None:
         """Send the rest, and say that there will be no more."""
         while self._has_more and time.monotonic() < deadline_s:
-            select.select([], [self._socket], [], 0.1)
+            select.select([], [self._socket], [], _TELL_S)
             self._flush()
+            self._note_progress()
         self._socket.close()
 
     def wait(self, deadline_s: float) -> None:
         """Until the process has ended."""
-        try:
-            self._process.wait(max(0.1, deadline_s - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            self._process.kill()  # and not waited for: on a busy machine that takes its time, too
-            print(
-                "a figure could not be drawn in time, and was not saved at the end", file=sys.stderr
-            )
+        while self._process.poll() is None:
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                self._process.kill()  # and not waited for: on a busy machine that takes time, too
+                print(
+                    "a figure could not be drawn in time, and was not saved at the end",
+                    file=sys.stderr,
+                )
+                break
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(min(left_s, _TELL_S))
+            self._note_progress()
         if self.dropped:
             count = self.dropped + self._sent
             print(f"{self.dropped} of {count} updates were not drawn", file=sys.stderr)
+
+    def _note_progress(self) -> None:
+        """The node may go on with its end, which waits for the drawing process."""
+        if self._node is not None:
+            self._node.progress("")
 
     @property
     def _has_more(self) -> bool:
@@ -195,6 +220,8 @@ class _Figure:
         duration: how many seconds are shown, the latest ones; ``None``: all.
         below: another figure, whose window and file this one shares, underneath.
         save_every: seconds of wall time between two times that it is saved.
+        node: the ``node`` of the hook. When it ends it waits up to a minute until its figure is
+            saved; without it there are two seconds for that.
 
     Attributes:
         file: where the figure is saved.
@@ -212,6 +239,7 @@ class _Figure:
         *,
         below: _Figure | None = None,
         save_every: float = 10.0,
+        node: _Node | None = None,
         **options: Any,
     ) -> None:
         self._kinds: dict[str, str] = {}
@@ -219,7 +247,8 @@ class _Figure:
             if find_spec("matplotlib") is None:
                 raise EnvironmentFault("figures need Matplotlib: pip install 'neuros[plot]'")
             self.file = _file_for(title)
-            self._feed = _Feed(("figure", title, str(self.file), float(save_every)), self.file)
+            first = ("figure", title, str(self.file), float(save_every))
+            self._feed = _Feed(first, self.file, node)
             self._panels = [self]
         else:
             self.file, self._feed, self._panels = below.file, below._feed, below._panels
@@ -259,7 +288,7 @@ class VisualiseLines(_Figure):
     """Numbers over time.
 
     Args:
-        title, duration, below, save_every: see :class:`VisualiseRotations`.
+        title, duration, below, save_every, node: see :class:`VisualiseRotations`.
         y_label: of the vertical axis.
     """
 
@@ -273,8 +302,11 @@ class VisualiseLines(_Figure):
         y_label: str = "",
         below: _Figure | None = None,
         save_every: float = 10.0,
+        node: _Node | None = None,
     ) -> None:
-        super().__init__(title, duration, below=below, save_every=save_every, y_label=y_label)
+        super().__init__(
+            title, duration, below=below, save_every=save_every, node=node, y_label=y_label
+        )
 
     def add_line(self, name: str, colour: str | None = None, style: str = "-") -> None:
         """Add a line; ``colour`` and ``style`` are Matplotlib's."""
@@ -294,6 +326,8 @@ class VisualiseRotations(_Figure):
         duration: how many seconds are shown, the latest ones; ``None``: all.
         below: another figure, whose window and file this one shares, underneath.
         save_every: seconds of wall time between two times that it is saved.
+        node: the ``node`` of the hook. When it ends it waits up to a minute until its figure is
+            saved; without it there are two seconds for that.
 
     Raises:
         EnvironmentFault: if Matplotlib is not installed.
@@ -337,9 +371,14 @@ class VisualiseImages(_Figure):
     _KIND = "images"
 
     def __init__(
-        self, title: str, *, below: _Figure | None = None, save_every: float = 10.0
+        self,
+        title: str,
+        *,
+        below: _Figure | None = None,
+        save_every: float = 10.0,
+        node: _Node | None = None,
     ) -> None:
-        super().__init__(title, None, below=below, save_every=save_every)
+        super().__init__(title, None, below=below, save_every=save_every, node=node)
 
     def add_image(self, name: str) -> None:
         """Add a place for an image."""
@@ -366,7 +405,7 @@ class VisualiseSpikes(_Figure):
     """Spikes of populations of neurons: a point for each, neuron against time.
 
     Args:
-        title, duration, below, save_every: see :class:`VisualiseRotations`.
+        title, duration, below, save_every, node: see :class:`VisualiseRotations`.
     """
 
     _KIND = "spikes"
@@ -393,7 +432,7 @@ class VisualiseRing(_Figure):
     time, with the direction that it stands for (population vector).
 
     Args:
-        title, duration, below, save_every: see :class:`VisualiseRotations`.
+        title, duration, below, save_every, node: see :class:`VisualiseRotations`.
     """
 
     _KIND = "ring"

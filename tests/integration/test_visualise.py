@@ -195,6 +195,32 @@ def test_a_hook_never_waits_and_what_is_left_out_is_counted(capfd: Any) -> None:
     assert figure.file.exists()
 
 
+def test_a_node_shows_progress_until_its_figure_is_saved(tmp_path: Path) -> None:
+    closers: list[Callable[[], None]] = []
+    pid = 0
+
+    def progress(text: str) -> None:
+        assert text == ""  # the user is told by the launcher
+        if not told:  # meanwhile nothing is drawn: the machine is busy
+            os.kill(pid, signal.SIGCONT)
+        told.append(time.monotonic())
+
+    told: list[float] = []
+    node = SimpleNamespace(on_close=closers.append, progress=progress)
+    figure = VisualiseLines("speed", node=node)
+    below = VisualiseLines("height", below=figure, node=node)
+    below.add_line("z")
+    below.plot("z", 1.0, 0.0)
+    pid = figure._feed._process.pid
+    os.kill(pid, signal.SIGSTOP)
+    (close,) = closers  # one for the figure, whatever shares it
+    assert not figure.file.exists()
+    close()
+    assert told
+    assert figure.file == tmp_path / "speed.png"
+    assert figure.file.exists()
+
+
 def test_the_figure_is_saved_again_and_again_and_ends_with_its_node_killed_or_not(
     tmp_path: Path,
 ) -> None:

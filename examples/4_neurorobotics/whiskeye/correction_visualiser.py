@@ -25,11 +25,13 @@ PREDICTED = "what the network predicts for the left and the right eye"
 class Headings:
     """All series, {stamp in ns: heading in rad}, and their figures."""
 
-    def __init__(self):
+    def __init__(self, node):
         self.truths = {}
         self.newest_s = 0.0
         self.told = {name: {} for name in NAMES}
-        self.angles = VisualiseRotations("WhiskEye: corrected by its eyes", duration=None)
+        self.angles = VisualiseRotations(
+            "WhiskEye: corrected by its eyes", duration=None, node=node
+        )
         self.angles.add_quaternion(TRUTH, "0.6")
         for name, colour in COLOURS.items():
             self.angles.add_radians(NAMES[name], colour)
@@ -50,7 +52,7 @@ class Headings:
 
 @neuros_initialise()
 def start(node):
-    node.set_user_data(Headings())
+    node.set_user_data(Headings(node))
 
 
 # One hook per series: none waits for another.

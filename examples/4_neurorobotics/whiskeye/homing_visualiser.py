@@ -21,10 +21,10 @@ MEAN_OF = 25  # poses
 class Homing:
     """Rows ``(stamp in ns, x in m, y in m, heading in rad, right in N, left in N)``; figures."""
 
-    def __init__(self):
+    def __init__(self, node):
         self.rows = []
         self.remembered = None  # stamp in ns, heading in rad
-        self.headings = VisualiseRotations("WhiskEye: back to a heading", duration=None)
+        self.headings = VisualiseRotations("WhiskEye: back to a heading", duration=None, node=node)
         self.headings.add_radians(ESTIMATE, "C3")
         self.headings.add_quaternion(TRUTH, "k")
         self.headings.add_radians(REMEMBERED, "C0")
@@ -41,7 +41,7 @@ class Homing:
 
 @neuros_initialise()
 def start(node):
-    node.set_user_data(Homing())
+    node.set_user_data(Homing(node))
 
 
 @neuros_function(inputs=["truth", "touch"])

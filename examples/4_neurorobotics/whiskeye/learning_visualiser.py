@@ -35,7 +35,7 @@ __all__ = [
 
 @neuros_initialise()
 def start(node):
-    headings = Headings()
+    headings = Headings(node)
     headings.bias = VisualiseLines(LEARNT, None, y_label="rad/s", below=headings.angles)
     headings.bias.add_line(LEARNT)
     node.set_user_data(headings)

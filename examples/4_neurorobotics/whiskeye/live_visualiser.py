@@ -18,9 +18,9 @@ TRUTH, ESTIMATE, ERROR = "true heading", "estimate of the network", "error"
 class Headings:
     """Both series, {stamp in ns: heading in rad}, and their figures."""
 
-    def __init__(self):
+    def __init__(self, node):
         self.truths, self.estimates = {}, {}
-        self.angles = VisualiseRotations("WhiskEye: head direction", duration=None)
+        self.angles = VisualiseRotations("WhiskEye: head direction", duration=None, node=node)
         self.angles.add_quaternion(TRUTH, "0.6")
         self.angles.add_radians(ESTIMATE, "C3")
         self.errors = VisualiseLines("error", None, y_label="error (deg)", below=self.angles)
@@ -29,7 +29,7 @@ class Headings:
 
 @neuros_initialise()
 def start(node):
-    node.set_user_data(Headings())
+    node.set_user_data(Headings(node))
 
 
 @neuros_function(inputs="truth")
