@@ -117,10 +117,6 @@ class SimulatedNode:
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         self.read_time_s = read_s
 
-    def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
-        """The run has begun."""
-        return not cancelled()
-
     def note_simulated_time(self) -> bool:
         return self.read_time_s() < self.ends_at_s
 
