@@ -18,8 +18,6 @@ from neuros.api.execution import Execution
 from neuros.api.plan import Plan
 from neuros.api.run import Run
 
-_AT_EXIT_S = 20.0
-
 
 class LiveRun:
     """A run in a thread of its own, from :meth:`begin` on; :meth:`wait` gives what comes out.
@@ -174,7 +172,7 @@ class LiveRun:
 
     def _end_with_program(self) -> None:
         self.interrupt()
-        self._done.wait(_AT_EXIT_S)
+        self._done.wait()
 
 
 class _Through(io.TextIOBase):

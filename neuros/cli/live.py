@@ -37,8 +37,7 @@ _ECHO_PERIOD_S = 0.1
 _HZ_PERIOD_S = 1.0
 _POLL_S = 0.05
 _SHOWN = 8  # digits of a run's id
-_AGAIN_S = 10.0  # nodes have 5 s to drain and 5 s to finalise; then they are killed
-_GIVE_UP_S = 30.0
+_REMARK_S = 10.0  # nodes that save something may take any time
 _FILTERS = ("run", "project", "node", "backend", "state")
 _LIVES_S = 1.0
 
@@ -202,18 +201,13 @@ def _is_named(session: Session, name: str) -> bool:
 
 def _await_end(chosen: Sequence[Session]) -> None:
     """Until the reapers have gone, and with them all that they guard."""
-    begin_s = time.monotonic()
-    waiting, has_insisted = {session.run for session in chosen}, False
+    next_remark_s = time.monotonic() + _REMARK_S
+    waiting = {session.run for session in chosen}
     while waiting := waiting & {session.run for session in sessions()}:
-        waited_s = time.monotonic() - begin_s
-        if waited_s > _AGAIN_S and not has_insisted:
-            has_insisted = True
-            for session in chosen:
-                if session.run in waiting:
-                    session.interrupt()  # the second one kills at once
-        if waited_s > _GIVE_UP_S:
-            left = ", ".join(sorted(run[:_SHOWN] for run in waiting))
-            raise EnvironmentFault(f"not ended after {_GIVE_UP_S:g} s: {left}: see `neuros ps`")
+        if time.monotonic() >= next_remark_s:
+            next_remark_s += _REMARK_S
+            left = " ".join(sorted(run[:_SHOWN] for run in waiting))
+            print(f"still ending: {left}; `neuros stop {left}` once more kills", file=sys.stderr)
         time.sleep(_POLL_S)
 
 

@@ -91,6 +91,27 @@ def test_a_run_of_another_user_is_stopped_by_its_id(
     assert machine.stopped == ["b" * 16]
 
 
+def test_a_run_that_saves_something_is_waited_for_and_interrupted_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A second interrupt would kill it."""
+    interrupts: list[str] = []
+
+    class Saves(Session):
+        def interrupt(self) -> None:
+            interrupts.append(self.run)
+
+    run = Saves("a" * 16, "demo", "process", ("a",), "/runs/a", 0.0, (1, 1), user=os.getuid())
+    looks = iter(range(20))
+    monkeypatch.setattr(live, "sessions", lambda: [run] if next(looks, None) is not None else [])
+    monkeypatch.setattr(live, "remove_dead_runs", tuple)
+    monkeypatch.setattr(live, "_REMARK_S", 0.2)
+    assert main(["stop"]) == 0
+    assert interrupts == [run.run]
+    said = capsys.readouterr().err.splitlines()
+    assert said[0] == "still ending: aaaaaaaa; `neuros stop aaaaaaaa` once more kills"
+
+
 def test_where_others_have_runs_only_there_is_nothing_of_ones_own_to_stop(
     machine: Machine, capsys: pytest.CaptureFixture[str]
 ) -> None:
