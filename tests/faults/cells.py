@@ -65,14 +65,14 @@ class Cell:
         return self.kind is Kind.LIVES or in_thread
 
     @property
-    def is_before_first_hook(self) -> bool:
+    def is_before_start(self) -> bool:
         """Whether it strikes before ``--duration`` has begun to count."""
         return self.place in ("import", "initialise")
 
     @property
     def needs_interrupt(self) -> bool:
         """Whether only Ctrl+C ends the run."""
-        return self.kind in (Kind.HANGS, Kind.BLOCKS) and self.is_before_first_hook
+        return self.kind in (Kind.HANGS, Kind.BLOCKS) and self.is_before_start
 
     @property
     def ends_by_itself(self) -> bool:

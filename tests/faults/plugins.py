@@ -14,7 +14,6 @@ from .trials import ENDS_WITHIN_S, GIVES_UP_AFTER_S, Expected, Outcome, Place, T
 DRAINS_WITHIN_S = 5.0
 DURATION_S = 1.5
 _LOOKS_FOR_S = 1.0
-_ATTEMPTS = 3
 _CUT_SHORT = "had to be killed after 5 s without progress"
 
 
@@ -30,27 +29,22 @@ def run(cell: Cell, folder: Path, *, flood_bytes: int, within_s: float = ENDS_WI
         flood_bytes: how much ``flood_output`` writes.
         within_s: a run that takes longer to end is late; where nodes drain, 5 s more.
     """
-    for number in range(_ATTEMPTS):
-        attempt = folder / str(number)
-        attempt.mkdir()
-        trial = Trial(attempt, cell.fault, cell.place, flood_bytes)
-        with trial.start(cell.backend, duration_s=DURATION_S) as running:
-            due_s = _end_is_due(cell, trial, running)
-            expected = Expected(
-                cell.exit_codes,
-                last_says="" if cell.is_survived or cell.needs_interrupt else "victim",
-                within_s=GIVES_UP_AFTER_S,
-                has_traceback=_has_traceback(cell),
-            )
-            outcome = trial.outcome(place_of(cell), running, due_s, expected)
-        if trial.struck_s is not None:
-            break
-        # On a busy machine a run may be over before its second node has begun.
-        outcome.problems = ["no fault struck before the end of the run"]
+    trial = Trial(folder, cell.fault, cell.place, flood_bytes)
+    with trial.start(cell.backend, duration_s=DURATION_S) as running:
+        due_s = _end_is_due(cell, trial, running)
+        expected = Expected(
+            cell.exit_codes,
+            last_says="" if cell.is_survived or cell.needs_interrupt else "victim",
+            within_s=GIVES_UP_AFTER_S,
+            has_traceback=_has_traceback(cell),
+        )
+        outcome = trial.outcome(place_of(cell), running, due_s, expected)
+    if trial.struck_s is None:
+        outcome.problems.append("no fault struck before the end of the run")
     if outcome.exit_code and cell.may_be_cut_short and _CUT_SHORT not in outcome.said:
         outcome.problems.append(f"exit code {outcome.exit_code}, but not cut short")
     if cell.ends_by_itself and outcome.record:
-        # Both count from the first hook.
+        # Both count from time 0 of the run.
         outcome.took_s = outcome.record["wall_s"] - DURATION_S
     drains_s = DRAINS_WITHIN_S if cell.ends_by_itself and not cell.is_survived else 0.0
     outcome.is_late = outcome.took_s > within_s + drains_s

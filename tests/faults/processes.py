@@ -30,7 +30,6 @@ MOMENTS = {"starting": "import", "running": "function", "ending": "finalise"}
 
 _DURATION_S = 2.0
 _LONG_S = 20.0
-_ATTEMPTS = 3
 _STOPPED_S = 2.0
 _CLEANED_UP_WITHIN_S = 15.0
 _COMES_UP_WITHIN_S = 5.0
@@ -106,17 +105,11 @@ def process_faults() -> Iterator[ProcessFault]:
 
 def run(fault: ProcessFault, folder: Path) -> Outcome:
     """Let it strike a run in an empty folder, and judge what comes of that."""
-    for number in range(_ATTEMPTS):
-        attempt = folder / str(number)
-        attempt.mkdir()
-        with _engine_of(fault) as engine:
-            if (outcome := _tried(fault, attempt, engine)) is not None:
-                return outcome
-    raise RuntimeError(f"{fault.place}: runs were over before a hook ran")
+    with _engine_of(fault) as engine:
+        return _tried(fault, folder, engine)
 
 
-def _tried(fault: ProcessFault, folder: Path, engine: OwnEngine | None) -> Outcome | None:
-    """``None``: on a busy machine the run was over before its second node had begun."""
+def _tried(fault: ProcessFault, folder: Path, engine: OwnEngine | None) -> Outcome:
     at = "pass_by" if fault.moment == "running" else "dawdle"
     trial = Trial(folder, at, MOMENTS[fault.moment])
     address = {} if engine is None else {"DOCKER_HOST": engine.address}
@@ -125,7 +118,7 @@ def _tried(fault: ProcessFault, folder: Path, engine: OwnEngine | None) -> Outco
         trial.await_strike(running)
         struck_s = time.monotonic()
         if trial.struck_s is None:
-            return None
+            raise RuntimeError(f"{fault.place}: the run was over before that\n{running.output}")
         _strike(fault, trial, running, engine)
 
         def left() -> list[str]:

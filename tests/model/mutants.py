@@ -31,12 +31,17 @@ class Mutant:
 
 
 _begin_if_registered = Lifecycle._begin_if_registered
+_start = Lifecycle.start
 _subscription = Subscription.__init__
 
 
 def _begin_at_once(lifecycle: Lifecycle) -> None:
     lifecycle._unregistered = 0
     _begin_if_registered(lifecycle)
+
+
+def _begin_alone(lifecycle: Lifecycle, *, awaits_others: bool) -> None:
+    _start(lifecycle, awaits_others=False)
 
 
 def _spend_without_window(window: SendWindow, now_ns: int) -> None:
@@ -63,8 +68,13 @@ def _last_executed(schedule: Schedule) -> Iterator[Hook]:
 MUTANTS: Sequence[Mutant] = (
     Mutant(
         "a node begins when all its receivers are there",
-        "one lossless connection",
+        "a question and its answer",
         lambda: patch.object(Lifecycle, "_begin_if_registered", _begin_at_once),
+    ),
+    Mutant(
+        "a node runs when every node is ready",
+        "one lossless connection",
+        lambda: patch.object(Lifecycle, "start", _begin_alone),
     ),
     Mutant(
         "a hook runs when every receiver of its outputs is ready",

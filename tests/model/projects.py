@@ -141,6 +141,12 @@ def projects() -> Sequence[Project]:
             goal=2,
         ),
         Project(
+            "a question and its answer",
+            [one, wire("b.o -> a.x", 0, index=1)],
+            {"a": [begin(), sink()], "b": [relay(name="answer")]},
+            goal=1,
+        ),
+        Project(
             "lockstep, ended",
             [one, wire("b.o -> a.x", 0, index=1)],
             {"a": [begin(), relay(name="step")], "b": [relay(name="answer")]},

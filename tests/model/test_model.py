@@ -10,7 +10,7 @@ from .search import search, told
 from .world import Project
 
 PROJECTS = {project.name: project for project in projects()}
-SMALL = 1_000
+SMALL = 2_000
 """More states take minutes: those of projects that end, or in which a node dies."""
 LARGE = 50_000
 ENDING = [name for name in PROJECTS if "ended" in name or "dies" in name]

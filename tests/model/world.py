@@ -20,7 +20,7 @@ from neuros.control import Message, Probe, Probed
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.snapshot import snapshot
-from neuros.hooks import HookSpec
+from neuros.hooks import HookKind, HookSpec
 from neuros.launcher.quiescence import Probing, Verdict
 from neuros.project.model import Connection, Port
 from tests.engine.engine_bench import Clock, node_for
@@ -80,7 +80,7 @@ class ModelNode:
         self.events: deque[Event] = deque()
         self.numbers: dict[str, int] = {}
         self.last_taken: dict[tuple[str, str, str], int] = {}
-        self.is_there = False
+        self.is_there = self.is_ready = False
         self.is_dead = False
         self.is_over = False
         self.in_loop: list[str] = []
@@ -106,11 +106,16 @@ class ModelNode:
         return True
 
     def give_way(self) -> None: ...
-    def note_ready(self) -> None: ...
+
+    def note_ready(self) -> None:
+        self.is_ready = True
+        self.world.look_at_start()
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         if self.is_over:
             raise Broken(f"hook {self.name}.{hook.name} starts after the end")
+        if hook.spec.kind is not HookKind.INITIALISE and not self.world.is_ready:
+            raise Broken(f"hook {self.name}.{hook.name} starts before every node is ready")
         if self.last_round is not None:
             self._judge_draining(hook)
         for port, argument in zip(hook.spec.inputs, arguments, strict=True):
@@ -257,7 +262,7 @@ class World:
         for c in node.connections:
             if c.destination_node == name:
                 self.put(("registered", c), None)
-        node.engine.start()
+        node.engine.start(awaits_others=True)
 
     def _event(self, name: str) -> None:
         node = self._node(name)
@@ -310,6 +315,16 @@ class World:
         self.probing.look(self.now_s, 0.0)
 
     # the launcher
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether every node has told that it has initialised as far as it can alone."""
+        return all(node.is_ready for node in self.nodes.values())
+
+    def look_at_start(self) -> None:
+        """A node has become ready: the last one lets all begin."""
+        if self.is_ready:
+            self._tell_all(_activate)
 
     def _to_all(self, message: Message) -> None:
         assert isinstance(message, Probe)
@@ -373,6 +388,10 @@ class World:
             (node.last_taken.get((hook, c.destination_input, origin), 0) for hook in takers),
             default=self.project.goal,
         )
+
+
+def _activate(node: ModelNode) -> None:
+    node.engine.activate()
 
 
 def _drain(places: Sequence[int], node: ModelNode) -> None:
