@@ -12,7 +12,7 @@ from .world import Project
 PROJECTS = {project.name: project for project in projects()}
 SMALL = 2_000
 """More states take minutes: those of projects that end, or in which a node dies."""
-LARGE = 50_000
+LARGE = 100_000
 ENDING = [name for name in PROJECTS if "ended" in name or "dies" in name]
 
 
