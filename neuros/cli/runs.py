@@ -213,7 +213,7 @@ def _verify(options: argparse.Namespace) -> int:
         result, exit_code = "sent packets identical", EXIT_CONSUMED
         what = f"{packets}; {_were(taken)} consumed differently"
     if verdict.not_compared and exit_code in (0, EXIT_CONSUMED):
-        what += f"; {_were(verdict.not_compared)} not compared, or not to the end"
+        what += f"; {_were(verdict.not_compared)} not compared, or not whole"
     if options.format == JSON:
         print_json(
             {
