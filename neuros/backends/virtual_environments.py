@@ -72,7 +72,8 @@ class Entry(Kept):
     @property
     def stamp(self) -> Path:
         """An empty file: the environment is whole; without one, the launcher's own Python does."""
-        return self.folder / "neuros-whole" if self.folder.exists() else self.beside(".here")
+        has_folder = os.path.exists(self.folder)  # not in a cache that may not be entered
+        return self.folder / "neuros-whole" if has_folder else self.beside(".here")
 
     @property
     def future_python(self) -> Path:
@@ -81,8 +82,8 @@ class Entry(Kept):
 
     def python(self) -> Path | None:
         """The Python to run, if that has been settled and is there."""
-        python = self.future_python if self.folder.exists() else Path(sys.executable)
-        return python if self.stamp.exists() and os.access(python, os.X_OK) else None
+        python = self.future_python if os.path.exists(self.folder) else Path(sys.executable)
+        return python if os.path.exists(self.stamp) and os.access(python, os.X_OK) else None
 
     def settle(self) -> None:
         """From now on it is what the stamp says, and in use. Raises ``OSError``."""
@@ -152,7 +153,7 @@ class Choice:
 
         Raises ``OSError``.
         """
-        if self.base is None and (self.entry.python() or not self.entry.folder.exists()):
+        if self.base is None and (self.entry.python() or not os.path.exists(self.entry.folder)):
             self.entry.settle()
 
 

@@ -327,7 +327,7 @@ class Environment:
             faults = self._prove()
         if faults:
             raise EnvironmentFault(explain_missing_library("; ".join(faults)))
-        self._unfinished.unlink()
+        self._unfinished.unlink(missing_ok=True)  # two installations may go on at once
         self.compile()
 
     def compile(self) -> None:
