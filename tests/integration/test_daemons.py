@@ -20,16 +20,18 @@ from tests.launching import BACKENDS, Running, start
 
 DAEMON = """
 import os, sys
+marked, marking = os.pipe()
 if os.fork() == 0:
     os.setsid()
     if os.fork() == 0:
-        mark = os.path.join(os.environ["MARK"], str(os.getpid()))
+        open(os.path.join(os.environ["MARK"], str(os.getpid())), "w").close()
         os.closerange(0, 100)
         os.open("/dev/null", os.O_RDWR)
         os.chdir("/")
-        open(mark, "w").close()
         os.execve("/bin/sleep", ["sleep", "98765"], {})
     os._exit(0)
+os.close(marking)
+os.read(marked, 1)  # the daemon has left its mark, and closed its end
 os.wait()
 """
 PLUGIN = """
