@@ -241,11 +241,6 @@ class Engine:
         return self._lifecycle.is_started
 
     @property
-    def has_begun(self) -> bool:
-        """Whether it was started and every receiver has been found."""
-        return self._lifecycle.has_begun
-
-    @property
     def is_active(self) -> bool:
         """Whether it has begun, and need not wait for other nodes to become ready."""
         return self._lifecycle.has_begun and self._lifecycle.is_active
