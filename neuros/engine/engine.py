@@ -132,10 +132,13 @@ class Engine:
         self._pass()
 
     def activate(self) -> None:
-        """Every node of the project is ready: tick and function hooks may start."""
+        """Every node of the project is ready: tick and function hooks may start.
+
+        None starts before the next event. A hook of one node would delay time 0, from which ticks
+        count, for the nodes that share its thread.
+        """
         self._wake()
         self._lifecycle.activate()
-        self._pass()
 
     def on_packet(self, key: Connection | str, packet: Any) -> None:
         """A packet has arrived on a connection, or on the external topic of the input ``key``."""

@@ -195,7 +195,7 @@ class NodeRuntime:
             self._services.is_active.set()
 
     def activate(self) -> None:
-        """Every node of the project is ready: run tick and function hooks."""
+        """Every node of the project is ready: tick and function hooks may start from now on."""
         self._guard(self._loaded.activate)
         self._services.is_active.set()
 

@@ -382,6 +382,8 @@ class NodeProcess:
         self._is_active = True
         for node in self._nodes:
             node.activate()
+        for node in self._nodes:
+            node.on_timer()
 
     def _open_middleware(self) -> Middleware:
         middleware = self._make_middleware(self._files, self._fail_outside_hooks)

@@ -165,6 +165,11 @@ class Bench:
     def acknowledge_to_node(self, connection: str, position: int) -> list[str]:
         return self._ran(lambda: self.engine.on_acknowledgement(self.by_name[connection], position))
 
+    def activate(self) -> list[str]:
+        """Every node is ready, and the first event after that comes."""
+        self.engine.activate()
+        return self._ran(self.engine.on_timer)
+
     def register(self, connection: str) -> list[str]:
         return self._ran(lambda: self.engine.on_registered(self.by_name[connection]))
 

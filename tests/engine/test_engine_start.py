@@ -25,15 +25,23 @@ def test_only_initialise_hooks_start_before_every_node_is_ready() -> None:
     bench.engine.start(awaits_others=True)
     assert bench.pass_time(1.0) == []
     assert bench.ran == ["begin"]
-    bench.engine.activate()
+    bench.activate()
     assert bench.ran == ["begin", "loop"]
+
+
+def test_ticks_are_counted_from_then_also_behind_a_long_hook_of_another_node() -> None:
+    bench = Bench(tick("timed", 0.1), is_started=False)
+    bench.engine.start(awaits_others=True)
+    bench.engine.activate()
+    assert bench.pass_time(0.35) == ["timed"]
+    assert bench.engine.all_hooks[0].missed_ticks == 2
 
 
 def test_ticks_are_counted_from_when_every_node_is_ready() -> None:
     bench = Bench(tick("timed", 0.1), is_started=False)
     bench.engine.start(awaits_others=True)
     bench.pass_time(0.95)
-    bench.engine.activate()
+    bench.activate()
     assert bench.pass_time(0.09) == []
     assert bench.pass_time(0.02) == ["timed"]
     assert bench.engine.all_hooks[0].missed_ticks == 0
@@ -53,7 +61,7 @@ def test_a_node_whose_initialise_hook_waits_for_another_node_is_ready(sends: Any
     bench = Bench(initialise("begin"), waits, connections=[TO_B, FROM_B], is_started=False)
     bench.engine.start(awaits_others=True)
     assert (bench.ran, bench.told_ready) == (["begin"], 1)
-    bench.engine.activate()
+    bench.activate()
     bench.packet(str(FROM_B))
     assert bench.ran == ["begin", "waits"]
     assert bench.told_ready == 1
@@ -69,7 +77,7 @@ def test_a_node_whose_initialise_hook_waits_for_a_receiver_is_ready() -> None:
     )
     bench.engine.start(awaits_others=True)
     assert (bench.ran, bench.told_ready) == (["first"], 1)
-    bench.engine.activate()
+    bench.activate()
     bench.acknowledge_to_node(str(TO_B), 1)
     assert bench.ran == ["first", "second"]
 
@@ -93,7 +101,7 @@ def test_a_hook_that_has_its_packets_waits_until_every_node_is_ready() -> None:
     bench.engine.start(awaits_others=True)
     assert bench.packet(str(FROM_B)) == []
     assert bench.acknowledged == []
-    bench.engine.activate()
+    bench.activate()
     assert bench.ran == ["take"]
 
 
@@ -116,6 +124,6 @@ def test_a_drain_before_that_lets_hooks_only_work_off_what_comes() -> None:
     bench.engine.start(awaits_others=True)
     bench.packet(str(FROM_B))
     bench.engine.drain()
-    bench.engine.activate()
+    bench.activate()
     bench.pass_time(1.0)
     assert bench.ran == ["take"]

@@ -392,6 +392,7 @@ class World:
 
 def _activate(node: ModelNode) -> None:
     node.engine.activate()
+    node.engine.on_timer()
 
 
 def _drain(places: Sequence[int], node: ModelNode) -> None:

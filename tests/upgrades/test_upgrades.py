@@ -12,6 +12,7 @@ from launching import launch
 
 import neuros.bag
 from neuros.cli.main import main
+from neuros.cli.runs import EXIT_CONSUMED
 from neuros.distribution import __version__
 
 from .keeping import KEPT, PATIENCE_S, unpacked
@@ -80,6 +81,7 @@ def test_the_project_runs_and_carries_the_same_packets(
     assert finished.exit_code == 0, finished.output
     doubles = [2 * number for number in NUMBERS]
     assert finished.record["nodes"]["counter"]["results"] == {"doubles": doubles}
-    # Before it there may be notes on the connection that may lose packets.
-    *_, verdict = said(capsys, "verify", kept / "run", tmp_path / "again").splitlines()
-    assert verdict.startswith("identical: ")
+    # On the connection that may lose packets, a hook may have consumed others of them.
+    assert main(["verify", str(kept / "run"), str(tmp_path / "again")]) in (0, EXIT_CONSUMED)
+    *_, verdict = capsys.readouterr().out.splitlines()
+    assert verdict.startswith(("identical: ", "sent packets identical: "))
