@@ -31,6 +31,7 @@ include_patterns = [
     "CONTRIBUTING.md",
     "CHANGELOG.md",
     "docs/*.md",
+    "extensions/*/README.md",
     "docs/reference/**.md",
     "examples/**README.md",
     "workspace/README.md",

@@ -5,6 +5,7 @@ through the ``node`` object that every hook receives. Programs run projects with
 and look at what comes out with :class:`Run`.
 """
 
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -39,4 +40,25 @@ def __getattr__(name: str) -> Any:
         from neuros.distribution import __version__
 
         return __version__
+    if not name.startswith("_"):
+        from neuros.registry import NAMES
+
+        if name in NAMES or NAMES.missing(name):
+            return NAMES.load(name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+class _Extensions:
+    """Finds modules that extensions add to this package; asked when no other finder has one."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> Any:
+        """The module spec (:class:`importlib.abc.MetaPathFinder`)."""
+        if not name.startswith("neuros."):
+            return None
+        from neuros.registry import spec_of_name
+
+        return spec_of_name(name)
+
+
+sys.meta_path.append(_Extensions)

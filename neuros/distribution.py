@@ -4,7 +4,11 @@ A checkout has the folders of data at its top, and links to them in the package;
 package has the folders themselves.
 """
 
+from __future__ import annotations
+
+import re
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 __version__ = "2.0.0"
@@ -46,6 +50,29 @@ def python_command(
         code: what to run in place of a module; it begins with a simple statement.
     """
     return [str(python), "-c", f"{_LEAVE_OUT_FOLDER}; {code}", *arguments]
+
+
+def libraries() -> dict[str, Path]:
+    """What a Python elsewhere needs on its path to import this NeuROS with its extensions.
+
+    These are the package ``neuros`` and, of each distribution with an entry point in a group of
+    NeuROS, its packages and its metadata; by the names that they have on the path.
+    """
+    from importlib import metadata
+
+    found = {PACKAGE.name: PACKAGE}
+    for each in metadata.distributions():
+        entries = [entry for entry in each.entry_points if entry.group.startswith("neuros.")]
+        if not entries or each.name == "neuros":
+            continue
+        for name in {entry.module.partition(".")[0] for entry in entries}:
+            spec = find_spec(name)
+            for place in (spec.submodule_search_locations or ()) if spec else ():
+                found[name] = Path(place)
+        kept_name = re.sub(r"[-_.]+", "_", each.name).lower()  # as wheels have it
+        folder = Path(str(each.locate_file(f"{kept_name}-{each.version}.dist-info")))
+        found[folder.name] = folder
+    return found
 
 
 def install_command(extra: str = "") -> str:

@@ -570,6 +570,51 @@ class SimulatorKind(ABC):
         """What ``neuros doctor`` finds of it: its version, or how to install it; what it needs."""
 
 
+@dataclass(frozen=True)
+class Subcommand:
+    """A command of ``neuros``. Registered as an entry point of the group ``neuros.commands``.
+
+    Attributes:
+        module: is imported when the command is used. Its ``add_<command>(parser)`` adds the
+            arguments and sets the default ``command``, which is called with the parsed arguments
+            and returns the exit code. With ``prepare_<command>(parser, arguments)`` it adds options
+            that depend on others.
+        help: its line in ``neuros --help``; empty for a program that NeuROS starts itself.
+        is_for_people: whether its output goes to a terminal, and not to a log or a program.
+    """
+
+    module: str
+    help: str = ""
+    is_for_people: bool = True
+
+
+class ModelFormat(ABC):
+    """A format of models besides MuJoCo's own, an entry point of the group ``neuros.models``.
+
+    Attributes:
+        name: the suffix of its files, without the dot.
+    """
+
+    name: str
+
+    @abstractmethod
+    def find(self, name: str, folder: Path, environ: Mapping[str, str]) -> Path | None:
+        """The file of a model that is not in the project.
+
+        Args:
+            name: as the user gave it; may be relative, or a URI.
+            folder: of the plugin.
+        """
+
+    @abstractmethod
+    def read(self, file: Path, environ: Mapping[str, str]) -> tuple[Any, Sequence[str]]:
+        """An ``MjSpec``, and a line for each part of the file that it lacks, or has otherwise.
+
+        Raises:
+            DescriptionError: with all problems of the file.
+        """
+
+
 class BackEnd(ABC):
     """Where nodes run. Registered as an entry point of the group ``neuros.backends``.
 

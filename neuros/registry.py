@@ -6,8 +6,11 @@ A distribution registers a part as an entry point in its ``pyproject.toml``::
     slurm = "neuros_slurm:BACK_END"
 
 Ours stand in ``entry_points.txt`` beside this module, from where the build takes them, too. They
-are read there and not from the metadata of the installation, which containers do not have, which
-is out of date in a checkout that was updated, and which takes some 10 ms to search.
+are read there and not from the metadata of the installation, which is out of date in a checkout
+that was updated, and which takes some 10 ms to search.
+
+``extensions.txt`` has the parts of NeuROS's own extensions, so that an error can say which one to
+install.
 
 Of back ends, ``--backend`` chooses one here (:func:`choose`).
 """
@@ -18,29 +21,44 @@ import importlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.abc import Loader
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_loader
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Generic, TypeVar, cast
 
+from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
-from neuros.ports import BackEnd, Deployment, Notice, SimulatorKind, TransportKind
+from neuros.ports import (
+    BackEnd,
+    Deployment,
+    ModelFormat,
+    Notice,
+    SimulatorKind,
+    Subcommand,
+    TransportKind,
+)
 from neuros.project.model import Node, Project
 from neuros.project.suggest import did_you_mean
 
 Part = TypeVar("Part")
 OWN = Path(__file__).with_name("entry_points.txt")
+EXTENSIONS = Path(__file__).with_name("extensions.txt")
 US = "neuros"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry point: where a part is, as ``module:attribute``, and whose it is."""
+    """An entry point: ``module:attribute``, or a module, and the distribution that has it."""
 
     value: str
     distribution: str
 
     def load(self) -> object:
-        module, _, attribute = self.value.partition(":")
-        return getattr(importlib.import_module(module), attribute)
+        name, _, attribute = self.value.partition(":")
+        module = importlib.import_module(name)
+        return getattr(module, attribute) if attribute else module
 
 
 class Registry(Generic[Part]):
@@ -75,9 +93,21 @@ class Registry(Generic[Part]):
             self._loaded[name] = self._load(name)
         return self._loaded[name]
 
+    def missing(self, name: str) -> str:
+        """What to install for a part that one of NeuROS's extensions has; empty for others."""
+        extension = dict(_rows(EXTENSIONS, self._group)).get(name)
+        if extension is None or name in self:
+            return ""
+        return (
+            f"{self.noun} '{name}' is in the extension neuros-{extension}, which is not installed:"
+            f" {install_command(extension)}"
+        )
+
     def _load(self, name: str) -> Part:
         entry = self._own.get(name) or self._others.get(name)
         if entry is None:
+            if missing := self.missing(name):
+                raise UsageError(missing)
             known = [*self._further, *self]
             hint = did_you_mean(name, known)
             raise UsageError(
@@ -103,10 +133,7 @@ class Registry(Generic[Part]):
 
     @cached_property
     def _own(self) -> Mapping[str, Entry]:
-        # Every node process reads it: configparser takes 2 ms to import.
-        _, _, section = OWN.read_text("utf-8").partition(f"[{self._group}]\n")
-        rows = (row.split(" = ") for row in section.partition("\n[")[0].split("\n") if row)
-        return {name: Entry(value, US) for name, value in rows}
+        return {name: Entry(value, US) for name, value in _rows(OWN, self._group)}
 
     @cached_property
     def _others(self) -> Mapping[str, Entry]:
@@ -127,12 +154,53 @@ class Registry(Generic[Part]):
         return found
 
 
+def _rows(file: Path, group: str) -> Iterator[tuple[str, str]]:
+    """The names and values of a section. configparser would take 2 ms in every node to import."""
+    _, _, section = file.read_text("utf-8").partition(f"[{group}]\n")
+    for row in section.partition("\n[")[0].split("\n"):
+        if row:
+            name, _, value = row.partition(" = ")
+            yield name, value
+
+
 AUTO = "auto"
 """In place of the name of a back end: the best one that can be used."""
 
 BACK_ENDS: Registry[BackEnd] = Registry("neuros.backends", "back end", BackEnd, further=[AUTO])
 TRANSPORTS: Registry[TransportKind] = Registry("neuros.transports", "transport", TransportKind)
+SUBCOMMANDS: Registry[Subcommand] = Registry("neuros.commands", "command", Subcommand)
+NAMES: Registry[Any] = Registry("neuros.names", "name in neuros", object)
+MODELS: Registry[ModelFormat] = Registry(
+    "neuros.models", "model format", ModelFormat, further=["xml", "mjcf"]
+)
 SIMULATORS: Registry[SimulatorKind] = Registry("neuros.simulators", "simulator", SimulatorKind)
+
+
+class _Alias(Loader):
+    """Lets a module of an extension be imported under its name in ``neuros``, too."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self._module = module
+        self._spec = module.__spec__
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return self._module
+
+    def exec_module(self, module: ModuleType) -> None:
+        module.__spec__ = self._spec  # the import has put its own there
+
+
+def spec_of_name(name: str) -> ModuleSpec | None:
+    """The spec of ``neuros.<name>`` if that is a module of an extension.
+
+    Raises:
+        ModuleNotFoundError: if it is one of an extension that is not installed.
+    """
+    inner = name.partition(".")[2]
+    if missing := NAMES.missing(inner):
+        raise ModuleNotFoundError(missing, name=name)
+    module = NAMES.load(inner) if inner in NAMES else None
+    return spec_from_loader(name, _Alias(module)) if isinstance(module, ModuleType) else None
 
 
 @dataclass(frozen=True)

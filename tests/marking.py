@@ -20,7 +20,8 @@ from zlib import crc32
 
 import pytest
 
-HERE = f"{Path(__file__).parent}{os.sep}"
+ROOT = Path(__file__).resolve().parents[1]
+HERE = tuple(f"{ROOT / name}{os.sep}" for name in ("tests", "extensions"))
 KINDS = ("ros", "docker", "browser", "process", "slow")
 # By module, or by name in a module.
 REACHED = {
@@ -69,6 +70,7 @@ BY_NAME = {
         "fuzz/",
         "simulators/test_mujoco_opengl.py::TestDoctor",
         "snn/test_documented_node.py::test_its_spikes",
+        "test_extensions.py::test_what_an_extension_brings",
         "test_installation.py",
         "test_packages_installed.py",
         "testing/test_plugin_harness.py::test_what_is_not_looked_for",
@@ -78,6 +80,7 @@ BY_NAME = {
         "benchmarks/test_reproduce_tables.py",
         "cli/test_report_command.py",
         "documentation/test_site_parts.py::TestReference",
+        "extensions/neuros-robots/tests/test_sdf_kinematics.py",
         "examples/test_whiskeye_correction.py",
         "examples/test_whiskeye_homing.py",
         "examples/test_whiskeye_network.py",
@@ -86,7 +89,6 @@ BY_NAME = {
         "examples/test_whiskeye_training.py",
         "project/test_project_split.py",
         "recording/test_bag.py",
-        "simulators/convert/test_sdf_kinematics.py",
         "snn/test_nest_networks.py",
         "testing/test_harness_values.py",
         "transport/test_packet_values.py::TestEveryMessageClass",

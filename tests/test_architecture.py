@@ -99,8 +99,6 @@ THIRD_PARTY: dict[str, set[str]] = {
     "snn.nir.network_file": {"numpy", "h5py"},
     "tf": {"geometry_msgs"},
     "snn.nest": {"numpy", "nest"},
-    "simulators.convert": {"mujoco", "numpy"},
-    "simulators.convert.mjcf": {"mujoco", "numpy", "trimesh"},
     "backends.docker": {"docker", "requests"},
     "backends.console": {"tqdm"},
     "backends.machines.machine": {"numpy"},
@@ -130,7 +128,6 @@ THIRD_PARTY: dict[str, set[str]] = {
     "bag": {"rosbags", "numpy"},
     "viewers.dashboard": {"starlette", "uvicorn"},
     "viewers.rerun_feed": {"rerun", "numpy"},
-    "cli.convert": {"tabulate"},
     "testing": {"pytest", "hypothesis"},
 }
 # The engine is pure: no threads, no wall clock, no files.
@@ -189,7 +186,7 @@ def complaint(importer: str, imported: str) -> str | None:
     other = package_of(inner)
     if other is None or other in (package, PUBLIC_NAMES):
         return None
-    if package is PUBLIC_NAMES and {*other.modules} & {*OWNERS.values()}:
+    if package is PUBLIC_NAMES and {*other.modules} & {*OWNERS.values(), "registry"}:
         return None
     if package.holds("installation"):
         return None if other.holds("errors") else "the installation knows nothing but errors"

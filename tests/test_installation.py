@@ -284,7 +284,7 @@ class TestContainers:
     """The options of ``install.py`` are those of the command that it hands over to."""
 
     def arguments(self, *given: str) -> list[str]:
-        parsed = command.parse_options(given, ["mujoco", "nest", "plot"])
+        parsed = command.parse_options(given, command.STANDARD_EXTRAS)
         return list(build_arguments(parsed))
 
     def test_where_none_is_named_a_machine_without_docker_is_all_right(self) -> None:
@@ -306,7 +306,7 @@ class TestContainers:
     def test_a_wheelhouse_and_certificates_are_for_pip_as_well(self, tmp_path: Path) -> None:
         (tmp_path / "ca.pem").touch()
         given = ["--wheelhouse", str(tmp_path), "--ca-bundle", str(tmp_path / "ca.pem")]
-        settings = pip_settings(command.parse_options(given, ["mujoco", "nest", "plot"]))
+        settings = pip_settings(command.parse_options(given, command.STANDARD_EXTRAS))
         assert settings == {
             "PIP_NO_INDEX": "1",
             "PIP_FIND_LINKS": str(tmp_path),
@@ -317,18 +317,18 @@ class TestContainers:
         python = tmp_path / "python"
         python.write_text('#!/bin/sh\necho "$@"; exit 4\n')
         python.chmod(0o755)
-        parsed = command.parse_options([], ["mujoco", "nest", "plot"])
+        parsed = command.parse_options([], command.STANDARD_EXTRAS)
         assert build_containers(python, parsed) == 4
 
 
 class TestDocumentation:
     def extras_for(self, *given: str) -> list[str]:
-        return list(command.parse_options(given, ["mujoco", "nest", "plot", "dev", "docs"]).extras)
+        return list(command.parse_options(given, [*command.STANDARD_EXTRAS, "dev", "docs"]).extras)
 
     def test_only_who_asks_for_it_gets_what_builds_it(self) -> None:
-        assert self.extras_for() == ["mujoco", "nest", "plot"]
-        assert self.extras_for("--docs") == ["docs", "mujoco", "nest", "plot"]
-        assert self.extras_for("--dev") == ["dev", "docs", "mujoco", "nest", "plot"]
+        assert self.extras_for() == sorted(command.STANDARD_EXTRAS)
+        assert self.extras_for("--docs") == sorted(["docs", *command.STANDARD_EXTRAS])
+        assert self.extras_for("--dev") == sorted(["dev", "docs", *command.STANDARD_EXTRAS])
 
     def test_it_is_built_by_the_one_command_that_is_documented(self, tmp_path: Path) -> None:
         python = tmp_path / "python"

@@ -77,14 +77,18 @@ def canonical(name: str) -> str:
 
 
 def asked_for() -> Iterator[tuple[str, str]]:
-    """Each requirement of ``pyproject.toml``, with the lock file that it belongs to."""
+    """Each requirement of NeuROS and its extensions, with the lock file that it belongs to."""
     tomllib = pytest.importorskip("tomllib")
     table = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     project = table["project"]
     groups = {"core": project["dependencies"], **project["optional-dependencies"]}
     groups |= {"build": table["build-system"]["requires"], "uv": [UV]}
+    for folder in (ROOT / "extensions").iterdir():
+        project = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"]
+        groups[folder.name.removeprefix("neuros-")] = project["dependencies"]
+        groups |= project.get("optional-dependencies", {})
     for group, needs in groups.items():
-        yield from ((group, need) for need in needs if not need.startswith("neuros["))
+        yield from ((group, need) for need in needs if not need.startswith("neuros"))
 
 
 class TestLockFiles:

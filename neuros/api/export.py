@@ -38,7 +38,7 @@ from neuros.api.request import ExportOptions, check_names, parse_duration
 from neuros.backends.containers import bare_name, files_of, find_recipe
 from neuros.backends.domain import valid_domain
 from neuros.backends.node_command import THREAD_VARIABLES
-from neuros.distribution import PACKAGE, WORKSPACE, python_command
+from neuros.distribution import WORKSPACE, libraries, python_command
 from neuros.errors import ProjectError, UsageError
 from neuros.executors.executor import JobResources
 from neuros.executors.slurm import slurm_script
@@ -253,7 +253,8 @@ class Export:
         except shutil.Error as error:
             why = "\n".join(f"{path} cannot be copied: {text}" for path, _, text in error.args[0])
             raise UsageError(why) from error
-        shutil.copytree(PACKAGE, image / "lib/neuros", ignore=NOT_COPIED)
+        for name, folder in libraries().items():
+            shutil.copytree(folder, image / "lib" / name, ignore=NOT_COPIED)
         if WORKSPACE.is_dir():
             shutil.copytree(WORKSPACE, image / "lib/workspace", ignore=NOT_COPIED)
         spec = find_spec(_VENDORED)

@@ -18,7 +18,7 @@ from typing import Any
 from neuros.backends.containers import bare_name
 from neuros.backends.node_command import NodeProcess, node_process
 from neuros.backends.process_launchers import ProcessDeployment, ProcessLauncher
-from neuros.distribution import PACKAGE
+from neuros.distribution import libraries
 from neuros.errors import EnvironmentFault
 from neuros.options import Option
 from neuros.ports import BackEnd, Deployment, Finding, Launcher, NodeProgram
@@ -113,7 +113,7 @@ class _Images(ProcessDeployment):
 def _inside(process: NodeProcess, node: NodeFile, image: Path) -> NodeProcess:
     """The process in an image, where it sees the folders of the run under their own paths."""
     folders = node.folders
-    seen = {PACKAGE: _LIBRARY / PACKAGE.name}
+    seen = {folder: _LIBRARY / name for name, folder in libraries().items()}
     seen |= {path: path for path in (folders.project, folders.workspace, folders.run)}
     seen |= {python: python for python in node.messages}
     binds: list[str] = []

@@ -139,9 +139,11 @@ def choose_here(container: ContainerFolder, cache: Path) -> Choice:
 def _entry(
     container: ContainerFolder, requirements: Requirements, cache: Path, version: Version
 ) -> Entry:
+    here = _installed_here()
     what = [_FORMAT, container.is_own, requirements.digest, version, str(PACKAGE), own_needs()]
+    what += [name for name in here if os.path.basename(name).startswith("neuros_")]  # extensions
     if version == HERE:
-        what += [sys.executable, sys.version, _installed_here()]
+        what += [sys.executable, sys.version, here]
     key = hashlib.sha256(json.dumps(what).encode()).hexdigest()
     return Entry(cache / f"{container.name}-{key[:KEY_LENGTH]}")
 

@@ -38,7 +38,7 @@ from typing import TYPE_CHECKING
 
 from neuros.backends.containers import ContainerFolder
 from neuros.caching import UNUSED_S, Kept, cache_root, kept_in
-from neuros.distribution import PACKAGE, install_command, python_command
+from neuros.distribution import install_command, libraries, python_command
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import clean_environment, dotted
 from neuros.installation.packages import (
@@ -226,10 +226,11 @@ def _make_venv(choice: Choice, progress: Progress, run_environment: Mapping[str,
 
 
 def _add_links(choice: Choice) -> None:
-    """Give it this NeuROS, and, if it is a layer, what is here."""
+    """Give it this NeuROS with its extensions, and, if it is a layer, what is here."""
     folder = choice.entry.folder
     site_packages = folder / "lib" / f"python{dotted(choice.version)}" / "site-packages"
-    (site_packages / "neuros").symlink_to(PACKAGE, target_is_directory=True)
+    for name, place in libraries().items():
+        (site_packages / name).symlink_to(place, target_is_directory=True)
     if choice.is_layered:
         rows = [str(path) for path in packages_here()]
         if _is_here(_BOOTSTRAPPER):

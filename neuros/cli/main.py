@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Sequence
 from functools import cache
 from importlib import import_module
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NoReturn
 
 from neuros.cli import EXIT_CODES
 from neuros.cli.terminal import harmless_output
@@ -23,7 +23,9 @@ from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 from neuros.options import positive_number
 from neuros.ordinary_files import cannot_be_opened
+from neuros.ports import Subcommand
 from neuros.project.suggest import counted, did_you_mean, listed
+from neuros.registry import SUBCOMMANDS
 
 _NOT_OPENED = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOTDIR, errno.ENAMETOOLONG, errno.ELOOP),
@@ -32,72 +34,55 @@ _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 EXIT_NODE, EXIT_USAGE, EXIT_PROJECT, EXIT_ENVIRONMENT, EXIT_INTERRUPTED = 1, 2, 3, 4, 130
 
 
-class Command(NamedTuple):
-    """A command: its module, which has ``add_<command>(parser)``, and its line in the help.
-
-    With ``prepare_<command>(parser, arguments)`` the module adds options that depend on others.
-
-    Without help it is one that NeuROS starts itself.
-    """
-
-    module: str
-    help: str = ""
-
-    @property
-    def is_for_people(self) -> bool:
-        """Whether its output goes to a terminal; that of others goes to a log, or a program."""
-        return bool(self.help) or self.module in ("replay", "launch")
-
-    def add_to(self, commands: Any, name: str, *, is_whole: bool) -> None:
-        """Add it to the parser; ``is_whole``: with its options."""
-        if not self.help:
-            parser = commands.add_parser(name, add_help=False)
-        else:
-            parser = commands.add_parser(name, help=self.help, formatter_class=_Formatter)
-        if is_whole:
-            module = import_module(f"neuros.cli.{self.module}")
-            getattr(module, f"add_{name.replace('-', '_')}")(parser)
-            parser.prepare = getattr(module, f"prepare_{name}", None)
-
-
 COMMANDS = {
-    "new": Command("projects", "make a small project to start with"),
-    "example": Command("projects", "list the examples, or copy one"),
-    "launch": Command("launch", "run a project"),
-    "validate": Command("projects", "check a project without running it"),
-    "graph": Command("projects", "show the nodes and connections of a project"),
-    "types": Command("projects", "let editors know the fields of a project's messages"),
-    "build": Command("setup", "build message packages"),
-    "ps": Command("live", "show the runs of this user"),
-    "stop": Command("live", "stop a run, as Ctrl+C does"),
-    "topic": Command("live", "show the topics and packets of a run in progress"),
-    "logs": Command("live", "show what the nodes of a run have logged"),
-    "sweep": Command("launch", "run a project with many values and seeds, and make one table"),
-    "verify": Command("runs", "compare the packets of two runs"),
-    "report": Command("runs", "say what limited the speed of a run, and draw figures"),
-    "compare": Command("runs", "show the numbers of several runs side by side"),
-    "bag": Command("runs", "show or complete what a run has recorded"),
-    "replay": Command("replay", "run one node of a recorded run again, or publish recorded topics"),
-    "export": Command("launch", "write a project as files for Docker Compose or Kubernetes"),
-    "convert": Command("convert", "turn a robot or world in SDF or URDF into a MuJoCo model"),
-    "doctor": Command("setup", "check this machine, and prove that packets arrive"),
-    "containers": Command("setup", "build, list and remove the images that nodes run in"),
-    "benchmark": Command(
-        "setup", "measure what NeuROS costs, compared with the same program without it"
+    "new": Subcommand("neuros.cli.projects", "make a small project to start with"),
+    "example": Subcommand("neuros.cli.projects", "list the examples, or copy one"),
+    "launch": Subcommand("neuros.cli.launch", "run a project"),
+    "validate": Subcommand("neuros.cli.projects", "check a project without running it"),
+    "graph": Subcommand("neuros.cli.projects", "show the nodes and connections of a project"),
+    "types": Subcommand(
+        "neuros.cli.projects", "let editors know the fields of a project's messages"
     ),
-    "reproduce": Command("setup", "repeat the published experiments"),
-    "node": Command("node"),
-    "part": Command("launch"),
-    "import-plugin": Command("projects"),
-    "agent": Command("agent"),
-    "recorder": Command("recorder"),
-    "replayed": Command("replay"),
-    "dashboard": Command("views"),
-    "view": Command("views"),
+    "build": Subcommand("neuros.cli.setup", "build message packages"),
+    "ps": Subcommand("neuros.cli.live", "show the runs of this user"),
+    "stop": Subcommand("neuros.cli.live", "stop a run, as Ctrl+C does"),
+    "topic": Subcommand("neuros.cli.live", "show the topics and packets of a run in progress"),
+    "logs": Subcommand("neuros.cli.live", "show what the nodes of a run have logged"),
+    "sweep": Subcommand(
+        "neuros.cli.launch", "run a project with many values and seeds, and make one table"
+    ),
+    "verify": Subcommand("neuros.cli.runs", "compare the packets of two runs"),
+    "report": Subcommand(
+        "neuros.cli.runs", "say what limited the speed of a run, and draw figures"
+    ),
+    "compare": Subcommand("neuros.cli.runs", "show the numbers of several runs side by side"),
+    "bag": Subcommand("neuros.cli.runs", "show or complete what a run has recorded"),
+    "replay": Subcommand(
+        "neuros.cli.replay", "run one node of a recorded run again, or publish recorded topics"
+    ),
+    "export": Subcommand(
+        "neuros.cli.launch", "write a project as files for Docker Compose or Kubernetes"
+    ),
+    "doctor": Subcommand("neuros.cli.setup", "check this machine, and prove that packets arrive"),
+    "containers": Subcommand(
+        "neuros.cli.setup", "build, list and remove the images that nodes run in"
+    ),
+    "benchmark": Subcommand(
+        "neuros.cli.setup", "measure what NeuROS costs, compared with the same program without it"
+    ),
+    "reproduce": Subcommand("neuros.cli.setup", "repeat the published experiments"),
+    "node": Subcommand("neuros.cli.node", is_for_people=False),
+    "part": Subcommand("neuros.cli.launch"),
+    "import-plugin": Subcommand("neuros.cli.projects", is_for_people=False),
+    "agent": Subcommand("neuros.cli.agent", is_for_people=False),
+    "recorder": Subcommand("neuros.cli.recorder", is_for_people=False),
+    "replayed": Subcommand("neuros.cli.replay"),
+    "dashboard": Subcommand("neuros.cli.views", is_for_people=False),
+    "view": Subcommand("neuros.cli.views", is_for_people=False),
 }
+"""Of NeuROS itself; :data:`~neuros.registry.SUBCOMMANDS` has those of extensions."""
 
 
-_HIDDEN = {name for name, command in COMMANDS.items() if not command.help}
 _WANTED: dict[Any, str] = {
     int: "a whole number",
     float: "a number",
@@ -105,6 +90,7 @@ _WANTED: dict[Any, str] = {
 }
 
 
+_COMMAND = "COMMAND"
 _IN_WORDS = {
     "expected one argument": "needs a value",
     "expected at least one argument": "needs a value",
@@ -140,10 +126,14 @@ class _Parser(argparse.ArgumentParser):
         return options, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """As argparse does, but with the word that was probably meant, and no hidden commands."""
+        """As argparse does, but with what was probably meant, or the extension that has it."""
         if action.choices is None or value in action.choices:
             return
-        shown = [str(each) for each in action.choices if str(each) not in _HIDDEN]
+        shown = [str(each) for each in action.choices]
+        if isinstance(action, argparse._SubParsersAction):
+            shown = _with_help(action)
+            if action.metavar == _COMMAND and (missing := SUBCOMMANDS.missing(value)):
+                raise argparse.ArgumentError(None, missing)
         hint = did_you_mean(str(value), shown)
         if action.option_strings:
             text = f"must be {listed(shown)}, but is '{value}'"
@@ -254,9 +244,20 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
         formatter_class=_Formatter,
     )
     result.add_argument("--version", action="version", version=f"neuros {__version__}")
-    commands = result.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for name, each in COMMANDS.items():
-        each.add_to(commands, name, is_whole=command in (None, name))
+    commands = result.add_subparsers(title="commands", metavar=_COMMAND, required=True)
+    shown = COMMANDS
+    if command not in COMMANDS:  # what extensions bring takes some 10 ms to find
+        shown = COMMANDS | {name: SUBCOMMANDS.load(name) for name in SUBCOMMANDS}
+    for name, each in shown.items():
+        is_whole = command in (None, name)
+        if each.help:
+            added = commands.add_parser(name, help=each.help, formatter_class=_Formatter)
+        else:
+            added = commands.add_parser(name, add_help=False)
+        if is_whole:
+            module = import_module(each.module)
+            getattr(module, f"add_{name.replace('-', '_')}")(added)
+            added.prepare = getattr(module, f"prepare_{name}", None)
     return result
 
 
@@ -281,13 +282,19 @@ def _complete(line: str) -> None:
     program, *words = line.split() or [""]
     is_launch = program.endswith("launch.py")
     completed = parser("launch" if is_launch else _command_in(words))
+    (commands,) = (
+        each for each in completed._actions if isinstance(each, argparse._SubParsersAction)
+    )
     if is_launch:
-        completed = next(
-            action.choices["launch"]
-            for action in completed._actions
-            if isinstance(action, argparse._SubParsersAction)
-        )
-    argcomplete.autocomplete(completed, exclude=[*_HIDDEN])
+        completed = commands.choices["launch"]
+    argcomplete.autocomplete(
+        completed, exclude=[*(set(commands.choices) - {*_with_help(commands)})]
+    )
+
+
+def _with_help(commands: argparse._SubParsersAction[Any]) -> list[str]:
+    """The commands that are shown; the others are programs that NeuROS starts itself."""
+    return [each.dest for each in commands._choices_actions]
 
 
 def _flush() -> None:

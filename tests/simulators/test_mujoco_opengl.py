@@ -88,7 +88,7 @@ def run(
 ) -> subprocess.CompletedProcess[bytes]:
     """Run a program from which libraries are ``hidden``."""
     clean = {key: value for key, value in os.environ.items() if key not in CHOICES}
-    command = [sys.executable, "-c", program, str(Path(__file__).parent)]
+    command = [sys.executable, "-c", program, str(ROOT / "tests/support")]
     environment = {**clean, **without(hidden, folder), **environment}
     return subprocess.run(
         command, env=environment, capture_output=True, timeout=DEADLINE_S, check=False

@@ -15,7 +15,7 @@ from virtual_display import DEADLINE_S, virtual_display
 
 from neuros.simulators.mujoco import MuJoCo
 
-PROGRAM = Path(__file__).with_name("viewed_simulation.py")
+PROGRAM = Path(__file__).parents[1] / "support/viewed_simulation.py"
 
 
 class Simulation:

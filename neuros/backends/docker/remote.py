@@ -38,7 +38,7 @@ from neuros.backends.docker.engine import (
 from neuros.backends.docker.images import Image, image_for
 from neuros.backends.docker.settings import LIBRARY, MESSAGES, NETWORK_MODE, ROOT, limits
 from neuros.backends.node_command import DEFAULTS, without_mark
-from neuros.distribution import PACKAGE, python_command
+from neuros.distribution import libraries, python_command
 from neuros.errors import EnvironmentFault
 from neuros.project.deployment import Host
 from neuros.project.model import Node, memory_text
@@ -223,7 +223,8 @@ class AgentContainer:
             **limits(node),
         )
         try:
-            self._put({LIBRARY / PACKAGE.name: PACKAGE}, {_CACHE: user})
+            here = {LIBRARY / name: folder for name, folder in libraries().items()}
+            self._put(here, {_CACHE: user})
         except BaseException:
             self.close()
             raise

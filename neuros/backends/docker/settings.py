@@ -30,7 +30,7 @@ from neuros.backends.node_command import (
 )
 from neuros.backends.run_processes import RUN_ID
 from neuros.control import CONTROL_VARIABLE
-from neuros.distribution import PACKAGE
+from neuros.distribution import libraries
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.model import Folders, Node, NodeFile
@@ -126,7 +126,7 @@ def container_settings(
         told[CONTROL_VARIABLE] = address.replace(str(file.folders.run), str(FOLDERS.run))
     own = node_folder(file) / "node.json"
     mounts = [
-        mount(PACKAGE, LIBRARY / PACKAGE.name),
+        *(mount(folder, LIBRARY / name) for name, folder in libraries().items()),
         mount(file.folders.project, FOLDERS.project),
         mount(file.folders.run, FOLDERS.run, read_only=False),
         # In a folder that it may write to; but what it was told stays as it was.

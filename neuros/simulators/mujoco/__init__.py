@@ -11,7 +11,29 @@ An output has a sensor behind it::
 :mod:`~neuros.simulators.mujoco.commands`.
 """
 
-import neuros.simulators.convert  # noqa: F401 (imports MuJoCo without OpenGL where that does not work)
-from neuros.simulators.mujoco.simulator import MuJoCo
+import os
+
+
+def _import_mujoco() -> None:
+    """Import MuJoCo, also where the OpenGL that ``MUJOCO_GL`` names cannot be imported.
+
+    MuJoCo imports that at once, and only cameras need it: they name what is missing.
+    """
+    try:
+        import mujoco
+    except Exception:
+        chosen = os.environ.get("MUJOCO_GL")
+        if not chosen:
+            raise
+        os.environ["MUJOCO_GL"] = "disable"
+        try:
+            import mujoco  # noqa: F401
+        finally:
+            os.environ["MUJOCO_GL"] = chosen
+
+
+_import_mujoco()
+
+from neuros.simulators.mujoco.simulator import MuJoCo  # noqa: E402
 
 __all__ = ["MuJoCo"]

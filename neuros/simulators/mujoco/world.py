@@ -12,12 +12,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from neuros.errors import DescriptionError, ModelError
+from neuros.errors import DescriptionError, ModelError, UsageError
 from neuros.ports import NodeContext, Packet
 from neuros.project.model import Node
-from neuros.simulators.convert.elements import Finder, NotFound, finder
-from neuros.simulators.convert.sdf import convert_sdf
-from neuros.simulators.convert.urdf import read_urdf
+from neuros.registry import MODELS
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
 from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
 from neuros.simulators.mujoco.lookup import Problems, did_you_mean, has_any, names_of
@@ -27,11 +25,6 @@ from neuros.simulators.mujoco.timing import Schedule, Timebase
 
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
-_DESCRIPTIONS: Mapping[str, Callable[[Path, Finder], Any]] = {
-    ".urdf": read_urdf,
-    ".sdf": convert_sdf,
-    ".world": convert_sdf,
-}
 
 
 @dataclass(frozen=True)
@@ -332,17 +325,14 @@ def _resolve(node: NodeContext, model: str) -> Path:
     try:
         return node.resolve_path(model)
     except ModelError:
-        if Path(model).suffix.lower() not in _DESCRIPTIONS:
+        suffix, description = Path(model).suffix.lower()[1:], node.description
+        found = None
+        if suffix in MODELS:
+            environ = {**os.environ, **description.environment}
+            found = MODELS.load(suffix).find(model, description.plugin.parent, environ)
+        if found is None:
             raise
-        try:
-            return _finder(node.description).find(model, node.description.plugin.parent)
-        except NotFound:
-            pass
-        raise
-
-
-def _finder(description: Node) -> Finder:
-    return finder((), {**os.environ, **description.environment})
+        return found
 
 
 def _from_text(description: Node, model: str) -> tuple[Any, str]:
@@ -358,19 +348,18 @@ def _from_file(description: Node, path: Path, warn: Callable[[str], object]) -> 
         spec = _parsed(lambda: mujoco.MjSpec.from_string(path.read_text("utf-8")), str(path))
         spec.modelfiledir = str(path.parent)
         return spec
-    if kind not in _DESCRIPTIONS:
-        known = ", ".join((".xml", ".mjcf", *_DESCRIPTIONS))
-        raise ModelError(f"{path}: a model is a file in MJCF, URDF or SDF ({known})")
     try:
-        described = _DESCRIPTIONS[kind](path, _finder(description))
+        format_ = MODELS.load(kind[1:])
+    except UsageError as error:
+        raise ModelError(f"{path}: {error}") from error
+    try:
+        spec, lacks = format_.read(path, {**os.environ, **description.environment})
     except DescriptionError as error:
         raise ModelError(str(error)) from error
-    if described.not_taken:
-        count = sum(note.count for note in described.not_taken)
-        rows = "".join(f"\n  {note}" for note in described.not_taken)
-        things = "1 thing is" if count == 1 else f"{count} things are"
-        warn(f"{path.name}: {things} not converted, or converted differently:{rows}")
-    return described.spec
+    if lacks:
+        rows = "".join(f"\n  {row}" for row in lacks)
+        warn(f"{path.name}: not converted, or converted differently:{rows}")
+    return spec
 
 
 def _joints_of(spec: Any) -> set[str]:

@@ -10,9 +10,8 @@ import numpy as np
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from kinematics import DrawnModel, models, moved
-
-from neuros.simulators.convert.elements import Finder
-from neuros.simulators.convert.sdf import convert_sdf
+from neuros_robots.elements import Finder
+from neuros_robots.sdf import convert_sdf
 
 many = settings(
     max_examples=30,

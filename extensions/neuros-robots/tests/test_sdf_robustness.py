@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from neuros_robots.elements import Finder
+from neuros_robots.sdf import convert_sdf
 
 from neuros.errors import DescriptionError, Problem
-from neuros.simulators.convert.elements import Finder
-from neuros.simulators.convert.sdf import convert_sdf
 
 HERE = Path(__file__).resolve().parent
 EVERYTHING = HERE / "everything.sdf"

@@ -19,8 +19,8 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from neuros.simulators.convert.elements import Element, Finder, NotFound, NotTaken
-from neuros.simulators.convert.frames import Link, Pose, Vector, from_quaternion
+from neuros_robots.elements import Element, Finder, NotFound, NotTaken
+from neuros_robots.frames import Link, Pose, Vector, from_quaternion
 
 MARK = "made by `neuros convert`"
 """Stands in the first line of every file that is written here, and may be overwritten."""

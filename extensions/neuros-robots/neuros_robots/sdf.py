@@ -11,10 +11,10 @@ from typing import Any
 import mujoco
 
 from neuros.errors import Problem
-from neuros.simulators.convert import bodies, links
-from neuros.simulators.convert.elements import DEEPEST, Element, Finder, NotFound, Report, parse
-from neuros.simulators.convert.frames import Branch, Joint, Link, Scope, grow, place_all, read_scope
-from neuros.simulators.convert.mjcf import Building, Converted, Meshes, compile_boxed, said_by
+from neuros_robots import bodies, links
+from neuros_robots.elements import DEEPEST, Element, Finder, NotFound, Report, parse
+from neuros_robots.frames import Branch, Joint, Link, Scope, grow, place_all, read_scope
+from neuros_robots.mjcf import Building, Converted, Meshes, compile_boxed, said_by
 
 _OVERRIDDEN = ("pose", "static", "placement_frame")  # by the children of an <include>
 _MOST_LINKS = 1000

@@ -8,12 +8,13 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from neuros_robots.elements import Finder
+from neuros_robots.sdf import convert_sdf
 
-from neuros.simulators.convert.elements import Finder
-from neuros.simulators.convert.sdf import convert_sdf
+from neuros.distribution import EXAMPLES
 
 HERE = Path(__file__).resolve().parent
-BY_HAND = HERE.parents[2] / "examples/4_neurorobotics/whiskeye/whiskeye.xml"
+BY_HAND = EXAMPLES / "4_neurorobotics/whiskeye/whiskeye.xml"
 SIX_DIGITS = 2e-6
 
 

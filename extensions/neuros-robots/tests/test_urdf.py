@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 from describing import CUBE, Folder
+from neuros_robots.elements import Finder
+from neuros_robots.urdf import read_urdf
 
 from neuros.errors import DescriptionError
-from neuros.simulators.convert.elements import Finder
-from neuros.simulators.convert.urdf import read_urdf
 
 MOMENTS = '<inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'
 

@@ -14,9 +14,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from neuros.simulators.convert.elements import Element
-from neuros.simulators.convert.frames import Joint, Link, Pose, Scope, from_quaternion, from_rpy
-from neuros.simulators.convert.mjcf import Building
+from neuros_robots.elements import Element
+from neuros_robots.frames import Joint, Link, Pose, Scope, from_quaternion, from_rpy
+from neuros_robots.mjcf import Building
 
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _GEOMS = mujoco.mjtGeom

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 from describing import Folder, joint, link
+from neuros_robots.elements import Finder
+from neuros_robots.sdf import convert_sdf
 
 from neuros.errors import DescriptionError
-from neuros.simulators.convert.elements import Finder
-from neuros.simulators.convert.sdf import convert_sdf
 
 
 def test_all_problems_are_reported_at_once(folder: Folder) -> None:

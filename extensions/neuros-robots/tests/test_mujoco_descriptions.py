@@ -79,7 +79,7 @@ def test_a_robot_of_any_format_is_driven_and_measured_from_the_node_file(
 def test_what_is_not_taken_over_is_one_warning(tmp_path: Path, name: str, text: str) -> None:
     _, node = simulated(tmp_path, name, text)
     (warning,) = node.log.warnings
-    assert warning.startswith(f"{name}: 1 thing is not converted")
+    assert warning.startswith(f"{name}: not converted")
     assert f"{name}:" in warning.splitlines()[1]
 
 
@@ -140,7 +140,7 @@ def test_a_joint_that_has_an_actuator_is_not_driven_twice(tmp_path: Path) -> Non
 
 
 def test_another_kind_of_file_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"a model is a file in MJCF, URDF or SDF \(\.xml"):
+    with pytest.raises(ModelError, match=r"model format \'txt\': choose one of xml, mjcf, "):
         simulated(tmp_path, "arm.txt", MJCF)
 
 

@@ -10,11 +10,10 @@ import pytest
 from describing import CUBE, Folder, link, positions
 from hypothesis import given
 from hypothesis import strategies as st
-
-from neuros.simulators.convert.elements import Finder
-from neuros.simulators.convert.frames import from_rpy
-from neuros.simulators.convert.mjcf import _convex_hull, write_mjcf
-from neuros.simulators.convert.urdf import read_urdf
+from neuros_robots.elements import Finder
+from neuros_robots.frames import from_rpy
+from neuros_robots.mjcf import _convex_hull, write_mjcf
+from neuros_robots.urdf import read_urdf
 
 CORNERS = np.array([(-2, -1, 0), (2, -1, 0), (2, 1, 0), (-2, 1, 0)], float)
 FACES = "f 1 2 3\nf 1 3 4\n"

@@ -9,10 +9,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from neuros.simulators.convert import links
-from neuros.simulators.convert.elements import Element
-from neuros.simulators.convert.frames import Branch, Joint, Scope, Vector, read_pose
-from neuros.simulators.convert.mjcf import Building
+from neuros_robots import links
+from neuros_robots.elements import Element
+from neuros_robots.frames import Branch, Joint, Scope, Vector, read_pose
+from neuros_robots.mjcf import Building
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL = mujoco.mjtJoint.mjJNT_BALL

@@ -7,10 +7,10 @@ from typing import Any
 
 import mujoco
 import pytest
+from neuros_robots.elements import Finder
+from neuros_robots.sdf import Converted, convert_sdf
 
 from neuros.errors import DescriptionError
-from neuros.simulators.convert.elements import Finder
-from neuros.simulators.convert.sdf import Converted, convert_sdf
 
 BOX = "<geometry><box><size>1 2 3</size></box></geometry>"
 CUBE = """\

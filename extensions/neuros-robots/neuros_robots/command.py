@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 from neuros.errors import DescriptionError, EnvironmentFault, Problem, UsageError
 
 if TYPE_CHECKING:
-    from neuros.simulators.convert.elements import NotTaken
-    from neuros.simulators.convert.mjcf import Converted
+    from neuros_robots.elements import NotTaken
+    from neuros_robots.mjcf import Converted
 
 _EPILOG = """\
 exit codes:
@@ -55,7 +55,7 @@ def add_convert(convert: argparse.ArgumentParser) -> None:
 def _convert(options: argparse.Namespace) -> int:
     converted, source, output = _converted(options)
     try:
-        from neuros.simulators.convert.mjcf import write_mjcf
+        from neuros_robots.mjcf import write_mjcf
 
         files = write_mjcf(converted, source, output)
     except OSError as error:
@@ -80,10 +80,10 @@ def _convert(options: argparse.Namespace) -> int:
 
 def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
     try:
-        from neuros.simulators.convert.elements import NotFound, finder
-        from neuros.simulators.convert.mjcf import is_ours
-        from neuros.simulators.convert.sdf import convert_sdf, model_file
-        from neuros.simulators.convert.urdf import read_urdf
+        from neuros_robots.elements import NotFound, finder
+        from neuros_robots.mjcf import is_ours
+        from neuros_robots.sdf import convert_sdf, model_file
+        from neuros_robots.urdf import read_urdf
     except ImportError as error:
         text = f"neuros convert needs MuJoCo: `pip install mujoco` ({error})"
         raise EnvironmentFault(text) from error

@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from neuros.simulators.convert.elements import Element
+from neuros_robots.elements import Element
 
 Vector = npt.NDArray[np.float64]
 _OWN = ("", "__model__", "world")

@@ -15,9 +15,9 @@ from typing import Any
 import mujoco
 
 from neuros.errors import Problem
-from neuros.simulators.convert.bodies import follow_joint
-from neuros.simulators.convert.elements import Element, Finder, NotFound, Report, parse
-from neuros.simulators.convert.mjcf import (
+from neuros_robots.bodies import follow_joint
+from neuros_robots.elements import Element, Finder, NotFound, Report, parse
+from neuros_robots.mjcf import (
     Converted,
     Triangles,
     compile_boxed,
