@@ -10,7 +10,7 @@ from pathlib import Path
 
 from tabulate import tabulate
 
-from benchmarks import comparing, running, subjects
+from benchmarks import against, comparing, page, running, subjects
 from benchmarks.interruption import interrupted_by_termination
 from benchmarks.machine import ROOT
 from benchmarks.measure import Subject
@@ -27,7 +27,6 @@ def run(options: argparse.Namespace) -> int:
 
     Raises:
         UsageError: for a name or a file that does not exist.
-        EnvironmentFault: where figures are wanted and Matplotlib is missing.
     """
     if options.list:
         print(_list())
@@ -36,12 +35,24 @@ def run(options: argparse.Namespace) -> int:
         a, b = (Results.read(Path(file)) for file in options.compare)
         print(comparing.report(a, b))
         return 0
+    if options.against:
+        pairs = against.measure(
+            options.against,
+            options.subjects,
+            _say,
+            rows=options.rows,
+            rounds=options.rounds,
+            is_quick=options.quick,
+        )
+        print(against.table(pairs))
+        return int(any(pair.verdict == "slower" for pair in pairs))
     if options.files:
         results, code = _combined([Path(file) for file in options.files]), 0
     else:
         results, code = _measure(options)
     print(_report(results, is_whole=not (options.subjects or options.rows)))
-    _draw(results, options)
+    if options.write_docs:
+        page.write(results, ROOT / "docs")
     return code
 
 
@@ -105,19 +116,6 @@ def _report(results: Results, is_whole: bool) -> str:
     if results.is_quick:
         parts.append("A quick run: it shows that everything works; its figures mean nothing.")
     return "\n\n".join(parts)
-
-
-def _draw(results: Results, options: argparse.Namespace) -> None:
-    """Figures and documentation; Matplotlib is imported for nothing else."""
-    if not (options.figures or options.write_docs):
-        return
-    from benchmarks import figures, page
-
-    if options.figures:
-        for file in figures.draw(results, Path(options.figures)):
-            _say(f"drawn: {file}")
-    if options.write_docs:
-        page.write(results, ROOT / "docs")
 
 
 def _say(line: str) -> None:

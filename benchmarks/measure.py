@@ -83,28 +83,6 @@ Value = Union[Figure, Quotient, Difference]  # noqa: UP007 (evaluated on 3.10)
 
 
 @dataclass(frozen=True)
-class Plot:
-    """A figure of the documentation, one curve per series; axes with their units."""
-
-    key: str
-    title: str
-    x_label: str
-    y_label: str
-    is_log_x: bool = False
-    is_log_y: bool = False
-
-
-@dataclass(frozen=True)
-class Point:
-    """Where a row is shown in a plot, and its reference; an empty series is not drawn."""
-
-    plot: str
-    series: str
-    x: float
-    reference_series: str = ""
-
-
-@dataclass(frozen=True)
 class Case:
     """A row of the table before it is measured.
 
@@ -122,7 +100,6 @@ class Case:
     reference: Value | None = None
     against: str = ""
     bound: str | None = None
-    point: Point | None = None
 
     @property
     def candidates(self) -> frozenset[str]:
@@ -157,7 +134,6 @@ class Subject:
 
     description: str
     groups: tuple[Group, ...]
-    plots: tuple[Plot, ...] = ()
 
 
 @dataclass

@@ -12,7 +12,7 @@ from neuros.options import add_options, options_of, positive_number
 _BENCHMARK_EPILOG = """\
 exit codes:
   0    measured (whether the targets are met or not)
-  1    a measurement failed
+  1    a measurement failed, or with --against, a row is slower
   2    wrong usage
   4    there are no benchmarks: neuros is not installed from a source checkout
   130  ended by Ctrl+C: what was measured is kept
@@ -54,9 +54,14 @@ def add_benchmark(benchmark: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="measure nothing; show these results (if several files have a row, that of the last)",
     )
+    add(
+        "--against",
+        metavar="COMMIT",
+        help="measure this checkout and another commit in turn, and show their ratios; exit code 1"
+        " if a row is slower here by 5 %% at least, whatever it is by chance",
+    )
     add("--compare", nargs=2, metavar=("A", "B"), help="show what differs between two results")
-    add("--figures", metavar="DIR", help="draw figures of the results (SVG)")
-    add("--write-docs", action="store_true", help="put tables and figures into docs/numbers.md")
+    add("--write-docs", action="store_true", help="put the tables into docs/numbers.md")
     benchmark.set_defaults(command=_benchmark)
 
 

@@ -1,10 +1,9 @@
-"""The part of docs/numbers.md that is generated: tables, figures, and what was measured on."""
+"""The part of docs/numbers.md that is generated: tables, and what was measured on."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks import figures
 from benchmarks.results import Results
 from benchmarks.table import LEGEND, notice_lines, rows_table, symbols, targets_table
 from neuros.errors import UsageError
@@ -13,7 +12,7 @@ BEGIN, END = "<!-- generated: begin -->", "<!-- generated: end -->"
 
 
 def write(results: Results, docs: Path) -> None:
-    """Put the results between the markers of ``numbers.md``, and figures into ``figures/``.
+    """Put the results between the markers of ``numbers.md``.
 
     Raises:
         UsageError: if the page has no markers.
@@ -23,26 +22,17 @@ def write(results: Results, docs: Path) -> None:
     _, end, after = rest.partition(END)
     if not (begin and end):
         raise UsageError(f"{page} has no lines {BEGIN} and {END}")
-    drawn = figures.draw(results, docs / "figures")
-    body = generated(results, [file.relative_to(docs).as_posix() for file in drawn])
-    page.write_text(f"{before}{BEGIN}\n\n{body}\n\n{END}{after}", "utf-8")
+    page.write_text(f"{before}{BEGIN}\n\n{generated(results)}\n\n{END}{after}", "utf-8")
 
 
-def generated(results: Results, drawn: list[str]) -> str:
+def generated(results: Results) -> str:
     """The text between the markers."""
-    titles = {f"figures/{plot.key}.svg": plot.title for plot in results.plots}
-    pictures = [f"![{titles.get(file, 'All targets')}]({file})" for file in drawn]
-    # Figures without a title of a subject are those of the targets, and stand beside their table.
-    overview = [each for each, file in zip(pictures, drawn, strict=True) if file not in titles]
-    curves = [each for each, file in zip(pictures, drawn, strict=True) if file in titles]
     parts = [
         "### Targets",
         symbols(targets_table(results.rows, "pipe")),
         LEGEND,
-        *overview,
         "### Everything",
         _by_subject(results),
-        *curves,
         "### Measured on",
         _about(results),
     ]

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.machine import machine, versions
-from benchmarks.measure import Plot, Round
+from benchmarks.measure import Round
 from benchmarks.rows import Row
 from neuros.errors import UsageError
 
-SCHEMA = 1
+SCHEMA = 2
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,6 @@ class Results:
     versions: dict[str, str] = field(default_factory=dict)
     load_before: dict[str, float] = field(default_factory=dict)
     rows: list[Row] = field(default_factory=list)
-    plots: list[Plot] = field(default_factory=list)
     notices: list[Notice] = field(default_factory=list)
     rounds: dict[str, list[list[Round]]] = field(default_factory=dict)
     origins: list[Origin] = field(default_factory=list)
@@ -105,7 +104,6 @@ class Results:
         if schema != SCHEMA:
             raise UsageError(f"{file} has schema {schema}; this version reads {SCHEMA}")
         data["rows"] = [Row.from_json(each) for each in data["rows"]]
-        data["plots"] = [Plot(**each) for each in data["plots"]]
         data["notices"] = [Notice(**each) for each in data["notices"]]
         data["origins"] = [
             Origin(each["started"], each["commit"], tuple(each["subjects"]))
@@ -118,7 +116,6 @@ def combine(parts: Sequence[Results]) -> Results:
     """One result of several runs; of rows that several have, those of the last one."""
     whole = Results(parts[-1].started, any(each.is_quick for each in parts))
     rows: dict[tuple[str, str], Row] = {}
-    plots: dict[str, Plot] = {}
     origins: dict[tuple[str, str], list[Origin]] = {}
     for part in parts:
         whole.machine, whole.versions = part.machine, part.versions
@@ -126,9 +123,8 @@ def combine(parts: Sequence[Results]) -> Results:
         whole.rounds |= part.rounds
         rows |= {row.key: row for row in part.rows}
         origins |= {row.key: _origins(part, row.subject) for row in part.rows}
-        plots |= {plot.key: plot for plot in part.plots}
         whole.notices += part.notices
-    whole.rows, whole.plots = list(rows.values()), list(plots.values())
+    whole.rows = list(rows.values())
     whole.origins = list(dict.fromkeys(chain.from_iterable(origins.values())))
     return whole
 

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from benchmarks.intervals import Summary, Verdict, judge
-from benchmarks.measure import Case, Point, Round
+from benchmarks.measure import Case, Round
 from benchmarks.targets import BOUNDS, Bound
 
 
@@ -29,7 +29,6 @@ class Row:
     against: str = ""
     references: tuple[float, ...] = ()
     bound: str | None = None
-    point: Point | None = None
 
     @property
     def key(self) -> tuple[str, str]:
@@ -73,9 +72,8 @@ class Row:
     @classmethod
     def from_json(cls, data: dict[str, Any]) -> Row:
         """The inverse of :meth:`as_json`."""
-        point = data.get("point")
         lists = {name: tuple(data[name]) for name in ("values", "references")}
-        return cls(**{**data, **lists, "point": Point(**point) if point else None})
+        return cls(**{**data, **lists})
 
 
 def row_of(subject: str, case: Case, rounds: Sequence[Round]) -> Row | None:
@@ -92,5 +90,4 @@ def row_of(subject: str, case: Case, rounds: Sequence[Round]) -> Row | None:
         case.against,
         tuple(reference.of(each) for each in complete) if reference else (),
         case.bound,
-        case.point,
     )

@@ -31,7 +31,6 @@ def measure(
     for name, subject in subjects.items():
         results.load_before[name] = load_before()
         say(f"{name} (others keep {results.load_before[name]:.0%} of the cores busy)")
-        results.plots += subject.plots
         runs = [Run(group) for group in subject.groups]
         before = replace(results, rows=list(results.rows), notices=list(results.notices))
         for run in runs:

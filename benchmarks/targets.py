@@ -36,13 +36,9 @@ class Bound:
 
 @dataclass(frozen=True)
 class Target:
-    """One row: what, compared with what, measured by which subject, and its bounds.
-
-    ``short`` is for figures, where room is scarce.
-    """
+    """One row: what, compared with what, measured by which subject, and its bounds."""
 
     what: str
-    short: str
     reference: str
     subject: str
     bounds: tuple[Bound, ...]
@@ -51,42 +47,36 @@ class Target:
 TARGETS = (
     Target(
         "acknowledged lossless round trip, small packet, two processes on two cores",
-        "round trip, a core each",
         "bare rclpy.spin without acknowledgements, placed alike",
         "round_trip",
         (Bound("round-trip-core-each", 0.95, goal=0.8),),
     ),
     Target(
         "acknowledged lossless round trip, small packet, two processes on one core",
-        "round trip, one core",
         "bare rclpy.spin without acknowledgements, placed alike",
         "round_trip",
         (Bound("round-trip-one-core", 0.5),),
     ),
     Target(
         "acknowledged lossless round trip, small packet, two processes, unpinned",
-        "round trip, unpinned",
         "dora-rs",
         "round_trip",
         (Bound("round-trip-unpinned", 0.8),),
     ),
     Target(
         "round trip in one process, hook to hook, lossless",
-        "round trip, in process",
         "bare rclpy, two nodes in one executor",
         "round_trip",
         (Bound("round-trip-in-process", 0.25),),
     ),
     Target(
         "execution of a hook that does nothing (free-running)",
-        "hook execution",
         "",
         "engine",
         (Bound("hook", 10, unit="us"),),
     ),
     Target(
         "921,600 B there, small packet back, two processes, lossless",
-        "921,600 B and back",
         "dora-rs (shared memory)",
         "round_trip",
         (
@@ -96,7 +86,6 @@ TARGETS = (
     ),
     Target(
         "WhiskEye strict, process back end",
-        "WhiskEye strict, process",
         "one loop without a framework",
         "whiskeye",
         (
@@ -112,27 +101,23 @@ TARGETS = (
     ),
     Target(
         "WhiskEye strict, in process",
-        "WhiskEye strict, in process",
         "one loop without a framework",
         "whiskeye",
         (Bound("whiskeye-strict-in-process", 0.93, is_maximum=False),),
     ),
     Target(
         "WhiskEye hybrid, process back end",
-        "WhiskEye hybrid, process",
         "one loop without a framework",
         "whiskeye",
         (Bound("whiskeye-hybrid", 1.0, is_maximum=False),),
     ),
     Target(
         "WhiskEye without discard limit: IMU packets consumed per second",
-        "WhiskEye, no discard limit",
         "WhiskEye strict",
         "whiskeye",
         (Bound("whiskeye-no-discard-limit", 0.95, is_maximum=False),),
     ),
     Target(
-        "tick at 20 ms",
         "tick at 20 ms",
         "bare rclpy timer",
         "tick",
@@ -143,7 +128,6 @@ TARGETS = (
     ),
     Target(
         "overloaded node, process: greatest age of a command beside a camera",
-        "overload",
         "bare rclpy, with its better executor",
         "overload",
         (
@@ -153,7 +137,6 @@ TARGETS = (
     ),
     Target(
         "WhiskEye from the command to its first hook",
-        "first hook of WhiskEye",
         "",
         "start_up",
         (
@@ -163,35 +146,30 @@ TARGETS = (
     ),
     Target(
         "WhiskEye strict, a container per node",
-        "WhiskEye strict in containers",
         "a process per node",
         "containers",
         (Bound("containers-speed", 0.9, is_maximum=False),),
     ),
     Target(
         "WhiskEye in containers from the command to the first hook of every node",
-        "first hook of WhiskEye in containers",
         "",
         "containers",
         (Bound("containers-first-hook", 4.0, unit="s"),),
     ),
     Target(
         "memory per node (process), beyond a bare rclpy node",
-        "memory per node",
         "bare rclpy node",
         "memory",
         (Bound("memory", 10, unit="MB"),),
     ),
     Target(
         "idle project of 3 nodes: share of a core",
-        "idle, 3 nodes",
         "",
         "idle",
         (Bound("idle", 0.01),),
     ),
     Target(
         "WhiskEye with everything recorded: share of its speed without recording",
-        "WhiskEye, recorded",
         "",
         "recording",
         (
@@ -201,7 +179,6 @@ TARGETS = (
     ),
     Target(
         "recorder: from the spool into the bag",
-        "recorder",
         "",
         "recording",
         (
@@ -218,14 +195,12 @@ TARGETS = (
     ),
     Target(
         "WhiskEye strict, in process, with metrics: share of its speed without metrics",
-        "WhiskEye with its books",
         "",
         "ledger",
         (Bound("ledger", 0.98, is_maximum=False),),
     ),
     Target(
         "slow-down of a ring of 16 nodes against a ring of 2, packets/s",
-        "ring of 16 against 2",
         "slow-down of the rings in bare rclpy",
         "rings",
         (Bound("ring", 1.0),),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 
 from benchmarks.graphs import bare_chain, chain
-from benchmarks.measure import Case, Figure, Group, Plot, Point, Subject
+from benchmarks.measure import Case, Figure, Group, Subject
 
 SIZES = (2, 4, 8, 16)
 KINDS = {
@@ -18,32 +18,13 @@ KINDS = {
 }
 ROUNDS = 5
 
-PLOTS = (
-    Plot(
-        "chain-rate",
-        "Packets per second at the end of a chain",
-        "nodes",
-        "packets/s",
-        is_log_x=True,
-        is_log_y=True,
-    ),
-    Plot(
-        "chain-latency",
-        "A packet's way through a chain",
-        "nodes",
-        "first hook to last (us)",
-        is_log_x=True,
-        is_log_y=True,
-    ),
-)
-
 
 def subject(is_quick: bool) -> Subject:
     """Seconds in which packets are counted."""
     seconds = 0.3 if is_quick else 1.0
     sizes = SIZES[:2] if is_quick else SIZES
     groups = [_chains(nodes, backend, seconds) for nodes in sizes for backend in KINDS]
-    return Subject("chains of 2 to 16 nodes, lossless", tuple(groups), PLOTS)
+    return Subject("chains of 2 to 16 nodes, lossless", tuple(groups))
 
 
 def _chains(nodes: int, backend: str, seconds: float) -> Group:
@@ -60,7 +41,6 @@ def _chains(nodes: int, backend: str, seconds: float) -> Group:
             Figure(label, "rate"),
             Figure(bare, "rate"),
             bare,
-            point=Point("chain-rate", label, nodes, bare),
         ),
         Case(f"{name}, share of the packets that {bare} delivers", "", Figure(bare, "delivered")),
         Case(
@@ -69,7 +49,6 @@ def _chains(nodes: int, backend: str, seconds: float) -> Group:
             Figure(label, "latency"),
             Figure(bare, "latency"),
             bare,
-            point=Point("chain-latency", label, nodes, bare),
         ),
     )
     return Group(candidates, cases, ROUNDS)

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Callable
 
 from benchmarks.graphs import bare_many_to_one, bare_one_to_many, many_to_one, one_to_many
-from benchmarks.measure import Case, Figure, Group, Plot, Point, Subject
+from benchmarks.measure import Case, Figure, Group, Subject
 
 SIZES = (2, 4, 8)
 ROUNDS = 5
@@ -29,11 +29,7 @@ def subject(is_quick: bool) -> Subject:
         for backend in KINDS:
             groups.append(_fan("1-to", count, backend, seconds, one_to_many, bare_one_to_many))
             groups.append(_fan("to-1", count, backend, seconds, many_to_one, bare_many_to_one))
-    plots = (
-        Plot("1-to-n", "One sender, many receivers", "receivers", "packets/s, all receivers"),
-        Plot("n-to-1", "Many senders, one receiver", "senders", "packets/s"),
-    )
-    return Subject("one to many and many to one, lossless", tuple(groups), plots)
+    return Subject("one to many and many to one, lossless", tuple(groups))
 
 
 def _fan(
@@ -45,14 +41,13 @@ def _fan(
     bare: Callable[[int, bool, float], float],
 ) -> Group:
     label, reference = KINDS[backend]
-    name, plot = (f"1-to-{count}", "1-to-n") if kind == "1-to" else (f"{count}-to-1", "n-to-1")
+    name = f"1-to-{count}" if kind == "1-to" else f"{count}-to-1"
     case = Case(
         f"{name}, {label}, packets per second",
         "1/s",
         Figure(label),
         Figure(reference),
         reference,
-        point=Point(plot, label, count, reference),
     )
     candidates = {
         label: functools.partial(neuros, count, backend, seconds),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 
-from benchmarks.measure import Case, Figure, Group, Measurement, Plot, Point, Subject
+from benchmarks.measure import Case, Figure, Group, Measurement, Subject
 from benchmarks.ping_pong import (
     IMU_PACKET,
     PACKETS,
@@ -32,21 +32,8 @@ DORA = "dora-rs"
 def subject(is_quick: bool) -> Subject:
     """Round trips per run: few, as there are many runs."""
     count = 300 if is_quick else 1500
-    plots = [
-        Plot(
-            f"round-trip-{backend}",
-            f"Round trip by size of the packet, {_words(backend)}",
-            "packet there (bytes; the two large ones: 8 bytes back)",
-            "round trip, median (µs)",
-            is_log_x=True,
-            is_log_y=True,
-        )
-        for backend in BACKENDS
-    ]
     groups = [_group(packet, backend, count) for packet in PACKETS for backend in BACKENDS]
-    return Subject(
-        "round trip by size of the packet, discard limit and back end", tuple(groups), tuple(plots)
-    )
+    return Subject("round trip by size of the packet, discard limit and back end", tuple(groups))
 
 
 def _group(packet: Packet, backend: str, count: int) -> Group:
@@ -64,26 +51,17 @@ def _group(packet: Packet, backend: str, count: int) -> Group:
             candidates[DORA] = functools.partial(dora_rs, packet, count)
             what = f"round trip, {packet.name}, {backend}, discard limit 0, against {DORA}"
             value = Figure("discard limit 0", "median")
-            # NeuROS's curve is drawn from the rows against rclpy; this one adds that of dora-rs.
-            point = Point(f"round-trip-{backend}", "", packet.size, DORA)
-            cases.append(Case(what, "us", value, Figure(DORA, "median"), against=DORA, point=point))
+            cases.append(Case(what, "us", value, Figure(DORA, "median"), against=DORA))
     return Group(candidates, tuple(cases), rounds=6)
 
 
 def _case(packet: Packet, backend: str, limit: str, reference: str) -> Case:
-    is_first = limit == next(iter(LIMITS))
     return Case(
         f"round trip, {packet.name}, {_words(backend)}, {limit}",
         "us",
         Figure(limit, "median"),
         Figure(reference, "median"),
         reference,
-        point=Point(
-            f"round-trip-{backend}",
-            f"NeuROS, {limit}",
-            packet.size,
-            reference if is_first else "",
-        ),
     )
 
 

@@ -16,27 +16,20 @@ from typing import Any
 from benchmarks.graphs import STRING, lossless
 from benchmarks.launching import PLUGINS, project_of_plugins
 from benchmarks.live import live
-from benchmarks.measure import Case, Figure, Group, Plot, Point, Subject
+from benchmarks.measure import Case, Figure, Group, Subject
 from benchmarks.subjects.whiskeye import WHISKEYE
 
 SIZES = (1, 3, 16, 64)
 ROUNDS = {1: 5, 3: 5, 16: 5, 64: 3}
 LABELS = {"process": "process", "in-process": "in process"}
 FILE = "first_hook.txt"
-PLOT = Plot(
-    "start-up",
-    "From the command to the first hook of the last node",
-    "nodes",
-    "seconds",
-    is_log_x=True,
-)
 
 
 def subject(is_quick: bool) -> Subject:
     """Small projects only, if quick."""
     sizes = SIZES[:2] if is_quick else SIZES
     groups = [_ring_of(nodes) for nodes in sizes]
-    return Subject("launch to first hook", (_whiskeye(), *groups), (PLOT,))
+    return Subject("launch to first hook", (_whiskeye(), *groups))
 
 
 def _ring_of(nodes: int) -> Group:
@@ -46,10 +39,7 @@ def _ring_of(nodes: int) -> Group:
     cases = []
     for label in candidates:
         name = f"launch of {nodes} node{'s' if nodes > 1 else ''}, {label}"
-        point = Point("start-up", label, nodes)
-        cases.append(
-            Case(f"{name}, first hook of the last node", "s", Figure(label, "last"), point=point)
-        )
+        cases.append(Case(f"{name}, first hook of the last node", "s", Figure(label, "last")))
         cases.append(Case(f"{name}, first hook of any node", "s", Figure(label, "any")))
     return Group(candidates, tuple(cases), ROUNDS[nodes])
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from benchmarks.bare_nodes import results
 from benchmarks.graphs import run
-from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Plot, Point, Subject
+from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Subject
 
 JUDGED_MS = 20
 PERIODS_MS = (1, 5, JUDGED_MS, 100)
@@ -19,14 +19,6 @@ SECONDS = {1: 2.0, 5: 2.0, JUDGED_MS: 4.0, 100: 4.0}
 FEWER_ROUNDS = 5
 TOLERANCE_NS = 1_000_000
 BARE = "rclpy timer"
-PLOT = Plot(
-    "tick",
-    "Regularity of ticks",
-    "period (ms)",
-    "standard deviation (us)",
-    is_log_x=True,
-    is_log_y=True,
-)
 
 
 def subject(is_quick: bool) -> Subject:
@@ -34,7 +26,6 @@ def subject(is_quick: bool) -> Subject:
     return Subject(
         "regularity of ticks every 1, 5, 20 and 100 ms",
         tuple(_period(period_ms, 0.2 if is_quick else 1.0) for period_ms in PERIODS_MS),
-        (PLOT,),
     )
 
 
@@ -69,7 +60,6 @@ def _period(period_ms: int, share: float) -> Group:
                 Figure(BARE, "deviation"),
                 BARE,
                 bounds[1],
-                Point("tick", label, period_ms, BARE),
             ),
         ]
     return Group(candidates, tuple(cases), MINIMUM_PAIRS if is_judged else FEWER_ROUNDS)

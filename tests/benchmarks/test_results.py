@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from benchmarks.comparing import changes, report
-from benchmarks.measure import Plot, Point
 from benchmarks.results import Notice, Origin, Results, combine
 from benchmarks.rows import Row
 from benchmarks.table import rows_table, targets_table
@@ -34,8 +33,7 @@ def test_a_results_file_is_read_as_it_was_written(tmp_path: Path) -> None:
         {"cores": "2"},
         {"python": "3.11.7"},
         {"round_trip": 0.25},
-        [Row("s", "r", "us", (1.0, 2.5), "b", (3.0, 4.0), "hook", Point("p", "NeuROS", 8, "b"))],
-        [Plot("p", "Title", "x", "y", is_log_x=True)],
+        [Row("s", "r", "us", (1.0, 2.5), "b", (3.0, 4.0), "hook")],
         [Notice("s", "other", "dora-rs is not installed", False)],
         {"s": [[{"a": {"median": 1.0}}]]},
         [Origin("2026-11-21T08-00-00Z", "abc", ("s",))],
