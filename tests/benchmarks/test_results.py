@@ -50,7 +50,7 @@ def test_a_results_file_is_read_as_it_was_written(tmp_path: Path) -> None:
         ("", "is no results file"),
         ("[]", "is no results file"),
         ('{"rows": []}', "is no results file"),
-        ('{"schema": 99}', "has schema 99; this version reads 1"),
+        ('{"schema": 99}', "has schema 99; this version reads 2"),
     ],
 )
 def test_another_file_is_refused(tmp_path: Path, content: str | None, reason: str) -> None:
