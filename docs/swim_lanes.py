@@ -14,10 +14,11 @@ import argparse
 import tempfile
 from pathlib import Path
 
+from neuros_analysis.charts import timeline_figure
+from neuros_analysis.review import open_for_review
+from neuros_analysis.run_pages import png
+
 import neuros
-from neuros.analysis.charts import timeline_figure
-from neuros.analysis.run_pages import png
-from neuros.analysis.run_record import open_for_review
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"

@@ -11,11 +11,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neuros.api.project import Project
     from neuros.api.run import Run
-    from neuros.api.sweep import sweep
     from neuros.distribution import __version__
     from neuros.node.handle import NodeHandle as Node
 
-__all__ = ["Node", "Project", "Run", "__version__", "sweep"]
+__all__ = ["Node", "Project", "Run", "__version__"]
 
 
 def __getattr__(name: str) -> Any:
@@ -32,10 +31,6 @@ def __getattr__(name: str) -> Any:
         from neuros.api.run import Run
 
         return Run
-    if name == "sweep":
-        from neuros.api.sweep import sweep
-
-        return sweep
     if name == "__version__":
         from neuros.distribution import __version__
 

@@ -1,4 +1,4 @@
-"""Recorded packets of a run, as NumPy arrays, pandas frames and xarray datasets.
+"""Recorded packets of a run, as NumPy arrays; with ``neuros[analysis]``, as frames and datasets.
 
 ::
 
@@ -7,14 +7,12 @@
     with neuros.bag.open("runs/whiskeye/2026-11-21T15-00-00.000000Z") as bag:
         imu = bag["robot.imu"].array()            # structured array, one row per packet
         speed = imu["linear_acceleration.x"]
-        frame = bag["/clock"].frame()             # pandas, if it is installed
-        images = bag["robot.camera"].xarray()     # xarray, if it is installed
+        frame = bag["/clock"].frame()             # pandas
+        images = bag["robot.camera"].xarray()     # xarray
 """
 
 from __future__ import annotations
 
-import datetime
-import math
 import os
 import warnings
 from collections.abc import Iterator, Mapping
@@ -26,24 +24,14 @@ import numpy as np
 import numpy.typing as npt
 from rosbags.interfaces import Connection, QosDurability, QosReliability
 
-from neuros.errors import EnvironmentFault, UsageError
-from neuros.recording.columns import (
-    LOG_TIME,
-    PUBLISH_TIME,
-    Column,
-    columns_of,
-    dataset_of,
-    has_simulated_time,
-    library,
-    trains_of,
-)
+from neuros.errors import EnvironmentFault
+from neuros.recording.columns import LOG_TIME, PUBLISH_TIME, Column, columns_of
 from neuros.recording.recorder import lost_of, named, needs_repair, recorded_counts, repair
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
 from neuros.recording.stored import StoredTopics, are_left, damage_of, faults_of, opened, store_of
+from neuros.registry import BAG_FORMATS
 
 __all__ = ["Bag", "RawPacket", "RecordedTopic", "open"]
-
-_MOST_COLUMNS = 100
 
 
 class RawPacket(NamedTuple):
@@ -123,31 +111,10 @@ class RecordedTopic:
                 simulated time (a ``TimedeltaIndex``).
 
         Raises:
-            EnvironmentFault: if pandas is not installed.
-            UsageError: for the simulated time of a bag that has none.
+            UsageError: for the simulated time of a bag that has none, and without the extension
+                that makes frames.
         """
-        pd = library("pandas", "array()")
-        spread: dict[str, Any] = {}
-        columns = self.columns()
-        for name, column in columns.items():
-            elements = math.prod(column.shape[1:])
-            if column.ndim == 1:
-                spread[name] = column
-            elif elements <= _MOST_COLUMNS:
-                for place, single in enumerate(column.reshape(len(column), elements).T):
-                    spread[f"{name}[{place}]"] = single
-            else:
-                spread[name] = list(column)
-        if clock == "sim":
-            if not has_simulated_time(columns):
-                raise UsageError(
-                    f"{self.name} has no simulated time: no node of the run owns time, or the bag"
-                    ' is an SQLite file, which has no place for it. Use clock="wall"'
-                )
-            time = pd.to_timedelta(columns[PUBLISH_TIME], unit="ns")
-        else:
-            time = pd.to_datetime(columns[LOG_TIME], unit="ns", utc=True)
-        return pd.DataFrame(spread, index=time.rename("time"))
+        return BAG_FORMATS.load("frame")(self, clock)
 
     def xarray(self) -> Any:
         """An ``xarray.Dataset``: a variable for each field, along the dimension ``time``.
@@ -159,9 +126,9 @@ class RecordedTopic:
         definition states have it as the attribute ``units``.
 
         Raises:
-            EnvironmentFault: if xarray is not installed.
+            UsageError: without the extension that makes datasets.
         """
-        return dataset_of(self, self._bag.store.fielddefs, self._bag.start_ns)
+        return BAG_FORMATS.load("xarray")(self, self._bag.store.fielddefs, self._bag.start_ns)
 
     def neo(self) -> Any:
         """A ``neo.Segment`` of recorded spikes (``neuros_msgs/msg/Spikes``).
@@ -171,17 +138,10 @@ class RecordedTopic:
 
         Raises:
             EnvironmentFault: if Neo is not installed.
-            UsageError: for packets of another type, and for spikes of neurons that are not there.
+            UsageError: for packets of another type, and for spikes of neurons that are not there,
+                and without the extension that makes segments.
         """
-        neo = library("neo", "array()")
-        trains = trains_of(self)
-        segment = neo.Segment(name=self.name, topic=self.name, connection=self.connection or "")
-        span = {"t_start": trains.start_s, "t_stop": trains.end_s}
-        segment.spiketrains = [
-            neo.SpikeTrain(times_s, units="s", neuron=neuron, **span)
-            for neuron, times_s in enumerate(trains.times_s)
-        ]
-        return segment
+        return BAG_FORMATS.load("neo")(self)
 
     def nwb(self, file: str | os.PathLike[str]) -> None:
         """Write recorded spikes into a new file of Neurodata Without Borders, a unit per neuron.
@@ -191,15 +151,8 @@ class RecordedTopic:
             UsageError: as :meth:`neo`.
             OSError: if the file cannot be written.
         """
-        pynwb = library("pynwb", "neo()")
-        trains, run_id = trains_of(self), self._bag.custom.get("run_id", "unknown")
-        began = datetime.datetime.fromtimestamp(self._bag.start_ns / 1e9, datetime.timezone.utc)
-        content = pynwb.NWBFile(f"simulated spikes of {self.name}", run_id, began)
-        span = [(trains.start_s, trains.end_s)]
-        for neuron, times_s in enumerate(trains.times_s):
-            content.add_unit(id=neuron, spike_times=times_s, obs_intervals=span)
-        with pynwb.NWBHDF5IO(os.fspath(file), "w") as writer:
-            writer.write(content)
+        run_id = self._bag.custom.get("run_id", "unknown")
+        BAG_FORMATS.load("nwb")(self, file, run_id, self._bag.start_ns)
 
 
 class Bag:

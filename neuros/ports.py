@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from neuros.distribution import python_command
 from neuros.errors import EnvironmentFault
 from neuros.options import Option
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port, Project
 from neuros.stacks import ProcessThreads
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor, Future
+    from contextlib import AbstractContextManager
 
 Packet: TypeAlias = Any  # one ROS message
 HookFunction: TypeAlias = "Callable[..., Any]"  # gets the node and its inputs, returns packets
@@ -612,6 +617,100 @@ class ModelFormat(ABC):
 
         Raises:
             DescriptionError: with all problems of the file.
+        """
+
+
+Job: TypeAlias = "Callable[[], Any]"
+"""One run: a picklable callable, the result of which is picklable, too."""
+
+
+@dataclass(frozen=True)
+class JobResources:
+    """What a job asks a cluster for; ``None`` and 0: nothing, so the cluster's default holds."""
+
+    cpus: int | None = None
+    mem_bytes: int | None = None
+    gpus: int = 0
+
+    @classmethod
+    def of(cls, project: Project) -> JobResources:
+        """The ``resources`` of all nodes summed.
+
+        What a node does not declare counts nothing. A GPU that several nodes name counts once;
+        ``all`` stands for those that the job gets, and asks for one.
+        """
+        cpus = [node.resources.cpus for node in project.nodes if node.resources.cpus]
+        memory = [node.resources.mem_bytes for node in project.nodes if node.resources.mem_bytes]
+        gpus = {gpu for node in project.nodes for gpu in node.access.gpus}
+        return cls(
+            math.ceil(sum(cpus)) if cpus else None,
+            sum(memory) if memory else None,
+            max(len(gpus - {"all"}), int("all" in gpus)),
+        )
+
+    @classmethod
+    def most(cls, needs: Iterable[JobResources]) -> JobResources:
+        """What is enough for each of several jobs."""
+        listed = list(needs)
+        return cls(
+            max((each.cpus for each in listed if each.cpus), default=None),
+            max((each.mem_bytes for each in listed if each.mem_bytes), default=None),
+            max((each.gpus for each in listed), default=0),
+        )
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """A sweep whose runs are to be executed.
+
+    Attributes:
+        name: of the project.
+        folder: of the sweep, which every machine that executes runs sees under this path.
+        count: how many runs at once, ``None``: as many as there is room for.
+        resources: of each run.
+        distribution: has the code of the jobs; machines that execute them have it, too.
+    """
+
+    name: str
+    folder: Path
+    count: int | None
+    resources: JobResources
+    distribution: str
+
+
+class Jobs(Protocol):
+    """The jobs of one sweep."""
+
+    def submit(self, jobs: Sequence[Job]) -> Sequence[Future[Any]]:
+        """Hand over jobs, in this order; the futures have what they return.
+
+        Raises ``EnvironmentFault``.
+        """
+
+    def cancel(self) -> None:
+        """End the jobs. Those that begin later return at once by themselves."""
+
+
+class SweepExecutor(ABC):
+    """What executes runs of sweeps. An entry point of the group ``neuros.executors``.
+
+    Attributes:
+        name: in ``--executor``; that of the entry point.
+        place: what ``--executor NAME=...`` names, as ``ADDRESS``; empty: nothing.
+    """
+
+    name: str
+    place: str = ""
+
+    @abstractmethod
+    def open(self, place: str | None, plan: SweepPlan) -> AbstractContextManager[Jobs | Executor]:
+        """Connect to what executes; the end of the context waits for the jobs that go on.
+
+        A pool of :mod:`concurrent.futures` will do.
+
+        Raises:
+            UsageError: for a place or a count that makes no sense.
+            EnvironmentFault: if something is missing, or does not answer.
         """
 
 

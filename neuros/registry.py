@@ -18,7 +18,7 @@ Of back ends, ``--backend`` chooses one here (:func:`choose`).
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.abc import Loader
@@ -37,6 +37,7 @@ from neuros.ports import (
     Notice,
     SimulatorKind,
     Subcommand,
+    SweepExecutor,
     TransportKind,
 )
 from neuros.project.model import Node, Project
@@ -173,6 +174,9 @@ NAMES: Registry[Any] = Registry("neuros.names", "name in neuros", object)
 MODELS: Registry[ModelFormat] = Registry(
     "neuros.models", "model format", ModelFormat, further=["xml", "mjcf"]
 )
+EXECUTORS: Registry[SweepExecutor] = Registry("neuros.executors", "executor", SweepExecutor)
+BAG_FORMATS: Registry[Callable[..., Any]] = Registry("neuros.bag_formats", "format", object)
+"""What methods of recorded topics and runs return in the types of other libraries."""
 SIMULATORS: Registry[SimulatorKind] = Registry("neuros.simulators", "simulator", SimulatorKind)
 
 

@@ -31,7 +31,7 @@ _FORKING.set_forkserver_preload(
         "neuros.cli.environments",
         "neuros.api.execution",
         "neuros.api.loading",
-        "neuros.analysis.packets",
+        "neuros.api.packets",
         "neuros.backends.process_launchers",
     ]
 )

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from neuros.project.model import Connection
+
 PACKETS = 50
 PERIOD_NS = 10_000_000
 
@@ -20,6 +22,16 @@ def accounting(**spent: Any) -> dict[str, Any]:
         "scheduling": 0.0,
     }  # fmt: skip
     return nothing | spent
+
+
+def wires(**limits: int | None) -> dict[str, Connection]:
+    """Connections ``a_b=0``: from output ``out`` of a to input ``in`` of b, and its limit."""
+    found = {}
+    for index, (ends, limit) in enumerate(limits.items()):
+        source, destination = ends.split("_")
+        connection = Connection(source, "out", destination, f"in_{source}", limit, 1, index)
+        found[str(connection)] = connection
+    return found
 
 
 def run_folder(

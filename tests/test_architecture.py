@@ -59,7 +59,6 @@ PACKAGES = (
     Package(4, ("executors",)),
     Package(5, ("node",)),
     Package(5, ("launcher",)),
-    Package(6, ("analysis",)),
     Package(6, ("viewers",)),
     Package(7, ("api",)),
     Package(7, ("testing",)),
@@ -69,7 +68,7 @@ PACKAGES = (
 # neuros itself holds public names; every package may ask it for the version. Those of others
 # it imports when they are asked for.
 PUBLIC_NAMES = Package(2, ("",))
-OWNERS = {"Node": "node", "Project": "api", "Run": "api", "sweep": "api"}
+OWNERS = {"Node": "node", "Project": "api", "Run": "api"}
 PORTS = 3
 
 MESSAGES = {"builtin_interfaces", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"}
@@ -107,7 +106,9 @@ THIRD_PARTY: dict[str, set[str]] = {
     "pytest_plugin": {"pytest"},
     "gym": {"gymnasium", "mujoco", "numpy"},
     "datasets": {"gymnasium", "minari", "lerobot", "numpy"},
-    "api.sweep": {"tabulate"},
+    "api.packets": {"numpy", "xxhash"},
+    "api.run_record": {"tabulate"},
+    "api.verify": {"numpy", "xxhash"},
     "executors.executor": {"distributed"},
     "executors.slurm": {"submitit"},
     "messages.package": {"catkin_pkg"},
@@ -120,8 +121,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "cli.live": {"tabulate"},
     "cli.runs": {"tabulate"},
     "replay.replayed_node": {"debugpy"},
-    "recording": {"rosbags", "psutil", "matplotlib", "tabulate", "numpy", "xxhash"},
-    "analysis": {"matplotlib", "tabulate", "numpy", "xxhash"},
+    "recording": {"rosbags", "psutil", "tabulate", "numpy", "xxhash"},
     "visualise": {"numpy"},
     "visualise.program": {"matplotlib", "numpy"},
     "recording.columns": {"rosbags", "numpy"},

@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.executors.executor import EXECUTORS
 from neuros.ports import BackEnd
-from neuros.registry import BACK_ENDS, OWN, SIMULATORS, TRANSPORTS
+from neuros.registry import BACK_ENDS, EXECUTORS, OWN, SIMULATORS, TRANSPORTS
 from neuros.viewers.viewer import VIEWERS
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -18,8 +18,8 @@ from benchmarks.reproduce.packets import (
 )
 from benchmarks.reproduce.page import Section
 from benchmarks.reproduce.tables import Layout, Ours, Published, Remark
-from neuros.analysis.packets import read_packets
-from neuros.analysis.run_record import open_run
+from neuros.api.packets import read_packets
+from neuros.api.run_record import open_run
 
 FOLDER = ROOT / "examples" / "3_physics_simulation" / "elevator"
 FILES = {

@@ -25,7 +25,7 @@ from benchmarks.reproduce.page import Section
 from benchmarks.reproduce.tables import NOTHING, Layout, Ours, Remark, Table, spread_text
 from benchmarks.reproduce.whiskeye_runs import heading_error_module
 from benchmarks.subjects.whiskeye import WHISKEYE
-from neuros.analysis.run_record import open_run
+from neuros.api.run_record import open_run
 from neuros.errors import UsageError
 
 TRAINING = "training"

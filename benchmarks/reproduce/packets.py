@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.reproduce.load import load_between
-from neuros.analysis.run_record import PastRun
+from neuros.api.run_record import PastRun
 
 
 def packet_figures(past: PastRun, connections: Mapping[str, str]) -> dict[str, float | None]:

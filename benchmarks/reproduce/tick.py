@@ -14,7 +14,7 @@ from benchmarks.reproduce.kinds import Kind, Reading, Readings
 from benchmarks.reproduce.page import Section
 from benchmarks.reproduce.published import TICK_FIGURES, TICKS
 from benchmarks.reproduce.tables import Layout, Remark
-from neuros.analysis.run_record import open_run
+from neuros.api.run_record import open_run
 
 PERIOD_S = 1.0
 PARTS = {"neuros": "NeuROS", "rclpy": "bare rclpy timer"}

@@ -16,8 +16,8 @@ from benchmarks.reproduce.kinds import Kind, Reading, Readings
 from benchmarks.reproduce.page import Section
 from benchmarks.reproduce.published import VOTING
 from benchmarks.reproduce.tables import Layout, Ours, Remark
-from neuros.analysis.packets import read_packets
-from neuros.analysis.run_record import open_run
+from neuros.api.packets import read_packets
+from neuros.api.run_record import open_run
 
 PROJECT = ROOT / "examples" / "2_synchronisation" / "voting"
 THINK_S = 5.0

@@ -24,8 +24,8 @@ from benchmarks.reproduce.packets import (
     speed_percent,
 )
 from benchmarks.subjects.whiskeye import IMU, WHISKEYE
-from neuros.analysis.packets import read_packets
-from neuros.analysis.run_record import open_run
+from neuros.api.packets import read_packets
+from neuros.api.run_record import open_run
 
 FILES = {
     "tick_20ms": "tick_20ms.json",

@@ -14,7 +14,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from neuros.analysis.run_record import broken_budgets, losses, run_record, run_table
 from neuros.api.observation import Observation, check_observation
 from neuros.api.plan import Plan
 from neuros.api.run_folder import (
@@ -27,6 +26,7 @@ from neuros.api.run_folder import (
     summary,
     write_node_files,
 )
+from neuros.api.run_record import broken_budgets, losses, run_record, run_table
 from neuros.backends.console import (
     LAYOUT,
     LogTail,
@@ -357,7 +357,7 @@ def _import_for_record() -> None:
     """Import what makes the record while nodes end: that takes a tenth of a processor second."""
 
     def load() -> None:
-        for name in ("neuros.analysis.packets", "tabulate"):
+        for name in ("neuros.api.packets", "tabulate"):
             importlib.import_module(name)
 
     with contextlib.suppress(RuntimeError):  # no more threads: then it is imported when needed

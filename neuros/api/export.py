@@ -40,9 +40,9 @@ from neuros.backends.domain import valid_domain
 from neuros.backends.node_command import THREAD_VARIABLES
 from neuros.distribution import WORKSPACE, libraries, python_command
 from neuros.errors import ProjectError, UsageError
-from neuros.executors.executor import JobResources
 from neuros.executors.slurm import slurm_script
 from neuros.options import options_of
+from neuros.ports import JobResources
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import Folders, Node, NodeFile, Project, memory_text
 from neuros.project.paths import NOT_COPIED, files_to_copy

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import html
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.analysis.run_record import open_run, run_table
+from neuros.api.run_record import open_run, run_table
 from neuros.errors import RunError
 from neuros.project.scanner import read_bytes
+from neuros.registry import BAG_FORMATS
 
 if TYPE_CHECKING:
     from neuros.bag import Bag
@@ -98,12 +99,14 @@ class Run:
         return {name: node.get("results", {}) for name, node in self.nodes.items()}
 
     def connection_frame(self) -> Any:
-        """A ``pandas.DataFrame`` of the connections, a row each. Raises ``EnvironmentFault``."""
-        return frame_of(map(connection_figures, self.record["connections"]), "connection")
+        """A ``pandas.DataFrame`` of the connections, a row each; of an extension."""
+        rows = map(connection_figures, self.record["connections"])
+        return BAG_FORMATS.load("table")(rows, "connection")
 
     def node_frame(self) -> Any:
-        """A ``pandas.DataFrame`` of the nodes: seconds by cause. Raises ``EnvironmentFault``."""
-        return frame_of((node_figures(name, node) for name, node in self.nodes.items()), "node")
+        """A ``pandas.DataFrame`` of the nodes: seconds by cause; of an extension."""
+        rows = (node_figures(name, node) for name, node in self.nodes.items())
+        return BAG_FORMATS.load("table")(rows, "node")
 
     @cached_property
     def bag(self) -> Bag:
@@ -170,16 +173,3 @@ def node_figures(name: str, node: Mapping[str, Any]) -> dict[str, Any]:
 
 def _number(value: Any) -> float | None:
     return None if value is None else float(value)
-
-
-def frame_of(rows: Iterable[Mapping[str, Any]], index: str | None = None) -> Any:
-    """A ``pandas.DataFrame``, one row each; ``index``: the column that names them.
-
-    Raises:
-        EnvironmentFault: if pandas is not installed.
-    """
-    from neuros.recording.columns import library
-
-    pd = library("pandas")
-    frame = pd.DataFrame(list(rows))
-    return frame if index is None or frame.empty else frame.set_index(index)

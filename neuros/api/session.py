@@ -20,9 +20,9 @@ from functools import partial
 from types import TracebackType
 from typing import Any
 
-from neuros.analysis.run_record import run_table
 from neuros.api.loading import seed_variables
 from neuros.api.run import Run
+from neuros.api.run_record import run_table
 from neuros.api.session_link import Held, SessionLink, connections_to, declared_at, port_of
 from neuros.backends.control_sockets import connect
 from neuros.control import (

@@ -1,4 +1,4 @@
-"""``neuros launch``, ``sweep`` and ``export``: runs with console, signals, and exit code.
+"""``neuros launch`` and ``export``: runs with console, signals, and exit code.
 
 What runs projects is imported late: ``--help`` and completion read this module, too.
 
@@ -12,17 +12,15 @@ import os
 import signal
 import socket
 import sys
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
-from neuros.api.request import FORMS, ExportOptions, LaunchOptions, Request, SweepOptions
+from neuros.api.request import FORMS, ExportOptions, LaunchOptions, Request
 from neuros.cli import EXIT_CODES
-from neuros.cli.common import JSON, add_format, add_project, load_with_messages, print_json
+from neuros.cli.common import add_project, load_with_messages
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.options import add_options, options_of, parsed_as, values_of
 from neuros.registry import AUTO, BACK_ENDS
@@ -31,8 +29,6 @@ if TYPE_CHECKING:
     from neuros.api.plan import Plan
     from neuros.ports import BackEnd
     from neuros.viewers.viewer import Views
-
-EXIT_FAILED = 1
 
 # <linux/sched.h>, <linux/sockios.h>, <net/if.h>
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
@@ -43,15 +39,6 @@ _REMEDY = (
     " kernel.apparmor_restrict_unprivileged_userns=0, user.max_user_namespaces > 0), use"
     " --backend docker, or leave --isolate out"
 )
-
-_SWEEP_EPILOG = """\
-exit codes:
-  0    all runs ended normally
-  1    a run did not; the others were made
-  2    wrong usage
-  3    the project is invalid with some of the values: nothing was run
-  130  ended by Ctrl+C: the runs that had ended are kept, and not run again
-"""
 
 
 def add_launch(launch: argparse.ArgumentParser) -> None:
@@ -229,50 +216,6 @@ def signals_noted() -> Iterator[tuple[list[int], socket.socket]]:
             signal.signal(number, signal.SIG_IGN if is_over else handler)
         reader.close()
         writer.close()
-
-
-def add_sweep(command: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
-    command.description = (
-        "Run a project with every combination of values and seeds, and write one"
-        " table (sweep.csv). Runs that have already finished in the same folder are not repeated."
-    )
-    command.epilog = _SWEEP_EPILOG
-    command.add_argument(
-        "project", metavar="PROJECT", help="a file, or a folder with a project.json"
-    )
-    add_options(command, options_of(SweepOptions))
-    add_format(command)
-    command.set_defaults(command=_sweep)
-
-
-def _sweep(parsed: argparse.Namespace) -> int:
-    from neuros.api.sweep import CSV_NAME, sweep
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("default", UserWarning)
-        warnings.showwarning = _warn
-        options = values_of(options_of(SweepOptions), parsed)
-        is_json = parsed.format == JSON
-        say = partial(_say_row, sys.stderr if is_json else sys.stdout)
-        made = sweep(parsed.project, **options, on_row=say)
-    if is_json:
-        print_json({"folder": made.folder, "rows": made.rows})
-    else:
-        print(f"\n{made}\n\n{made.folder / CSV_NAME}")
-    return 0 if all(row["exit_code"] == 0 for row in made.rows) else EXIT_FAILED
-
-
-def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
-    """What may be a mistake in the project, without the line of Python that found it."""
-    print(f"warning: {message}", file=sys.stderr)
-
-
-def _say_row(stream: TextIO, number: int, count: int, row: Mapping[str, Any]) -> None:
-    """One line when a run has ended."""
-    values = list(row)[: list(row).index("exit_code")]
-    what = ", ".join(f"{name}={row[name]}" for name in values) or "run"
-    print(f"[{number}/{count}] {what}: {row['reason']}", file=stream, flush=True)
 
 
 _OF_PARTS = ("domain_id", "peers", "peer_timeout", "duration", "output", "verbose")

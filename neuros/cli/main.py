@@ -48,14 +48,7 @@ COMMANDS = {
     "stop": Subcommand("neuros.cli.live", "stop a run, as Ctrl+C does"),
     "topic": Subcommand("neuros.cli.live", "show the topics and packets of a run in progress"),
     "logs": Subcommand("neuros.cli.live", "show what the nodes of a run have logged"),
-    "sweep": Subcommand(
-        "neuros.cli.launch", "run a project with many values and seeds, and make one table"
-    ),
     "verify": Subcommand("neuros.cli.runs", "compare the packets of two runs"),
-    "report": Subcommand(
-        "neuros.cli.runs", "say what limited the speed of a run, and draw figures"
-    ),
-    "compare": Subcommand("neuros.cli.runs", "show the numbers of several runs side by side"),
     "bag": Subcommand("neuros.cli.runs", "show or complete what a run has recorded"),
     "replay": Subcommand(
         "neuros.cli.replay", "run one node of a recorded run again, or publish recorded topics"

@@ -20,7 +20,7 @@ from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.suggest import counted
 
 if TYPE_CHECKING:
-    from neuros.analysis.run_record import PastRun
+    from neuros.api.run_record import PastRun
     from neuros.bag import RecordedTopic
     from neuros.hooks import HookSpec
     from neuros.project.model import NodeFile
@@ -185,11 +185,11 @@ def _replay_node(options: argparse.Namespace) -> int:
     """
     if options.replay_topics:
         raise UsageError("replay: --node runs a node, --topic publishes: choose one of them")
-    from neuros.analysis.recorded_node import RecordedNode, recorded_node
     from neuros.cli.environments import require_messages
     from neuros.distribution import WORKSPACE
     from neuros.messages.workspace import message_cache
     from neuros.replay.from_container import as_on_this_machine
+    from neuros.replay.recorded_node import RecordedNode, recorded_node
 
     run, file = recorded_node(Path(options.run).absolute(), options.node)
     file = as_on_this_machine(run, file, WORKSPACE, message_cache(os.environ))
@@ -233,11 +233,11 @@ def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
 
 def _replayed(options: argparse.Namespace) -> int:
     """The process that :func:`_replay_node` becomes."""
-    from neuros.analysis.recorded_node import RecordedNode
-    from neuros.analysis.run_record import open_run
+    from neuros.api.run_record import open_run
     from neuros.project.split import node_file_from_json
     from neuros.recording.provenance import python_versions
     from neuros.replay.from_container import note_on_versions, ran_in_container
+    from neuros.replay.recorded_node import RecordedNode
     from neuros.replay.replayed_node import ReplayedNode, debugpy_on, files_changed_since
 
     faulthandler.enable()

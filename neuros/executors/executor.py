@@ -1,150 +1,21 @@
-"""Executors of sweeps: their interface, the choice of ``--executor``, and those that are pools.
-
-Pools are threads of this process, and the workers of Dask.
-"""
+"""Runs of sweeps on the workers of a Dask scheduler."""
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import sys
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import ExitStack, contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.project.model import Project
-from neuros.registry import Registry
+from neuros.ports import SweepExecutor, SweepPlan
 
 _ANSWER_S = 20.0  # of a Dask scheduler
-
-Job: TypeAlias = Callable[[], Any]
-"""One run: a picklable callable, the result of which is picklable, too."""
-
-
-@dataclass(frozen=True)
-class JobResources:
-    """What a job asks a cluster for; ``None`` and 0: nothing, so the cluster's default holds."""
-
-    cpus: int | None = None
-    mem_bytes: int | None = None
-    gpus: int = 0
-
-    @classmethod
-    def of(cls, project: Project) -> JobResources:
-        """The ``resources`` of all nodes summed.
-
-        What a node does not declare counts nothing. A GPU that several nodes name counts once;
-        ``all`` stands for those that the job gets, and asks for one.
-        """
-        cpus = [node.resources.cpus for node in project.nodes if node.resources.cpus]
-        memory = [node.resources.mem_bytes for node in project.nodes if node.resources.mem_bytes]
-        gpus = {gpu for node in project.nodes for gpu in node.access.gpus}
-        return cls(
-            math.ceil(sum(cpus)) if cpus else None,
-            sum(memory) if memory else None,
-            max(len(gpus - {"all"}), int("all" in gpus)),
-        )
-
-    @classmethod
-    def most(cls, needs: Iterable[JobResources]) -> JobResources:
-        """What is enough for each of several jobs."""
-        listed = list(needs)
-        return cls(
-            max((each.cpus for each in listed if each.cpus), default=None),
-            max((each.mem_bytes for each in listed if each.mem_bytes), default=None),
-            max((each.gpus for each in listed), default=0),
-        )
-
-
-@dataclass(frozen=True)
-class SweepPlan:
-    """A sweep whose runs are to be executed.
-
-    Attributes:
-        name: of the project.
-        folder: of the sweep, which every machine that executes runs sees under this path.
-        count: how many runs at once, ``None``: as many as there is room for.
-        resources: of each run.
-    """
-
-    name: str
-    folder: Path
-    count: int | None
-    resources: JobResources
-
-
-class Jobs(Protocol):
-    """The jobs of one sweep."""
-
-    def submit(self, jobs: Sequence[Job]) -> Sequence[Future[Any]]:
-        """Hand over jobs, in this order; the futures have what they return.
-
-        Raises ``EnvironmentFault``.
-        """
-
-    def cancel(self) -> None:
-        """End the jobs. Those that begin later return at once by themselves."""
-
-
-class SweepExecutor(ABC):
-    """What executes runs of sweeps. An entry point of the group ``neuros.executors``.
-
-    Attributes:
-        name: in ``--executor``; that of the entry point.
-        place: what ``--executor NAME=...`` names, as ``ADDRESS``; empty: nothing.
-    """
-
-    name: str
-    place: str = ""
-
-    @abstractmethod
-    def open(self, place: str | None, plan: SweepPlan) -> AbstractContextManager[Jobs]:
-        """Connect to what executes; the end of the context waits for the jobs that go on.
-
-        Raises:
-            UsageError: for a place or a count that makes no sense.
-            EnvironmentFault: if something is missing, or does not answer.
-        """
-
-
-EXECUTORS: Registry[SweepExecutor] = Registry("neuros.executors", "executor", SweepExecutor)
-
-
-class PoolJobs:
-    """The jobs of a pool of :mod:`concurrent.futures`."""
-
-    def __init__(self, pool: Executor) -> None:
-        self._pool = pool
-
-    def submit(self, jobs: Sequence[Job]) -> list[Future[Any]]:
-        return [self._pool.submit(job) for job in jobs]
-
-    def cancel(self) -> None:
-        """Nothing: a job that begins now returns at once."""
-
-
-def open_executor(wanted: str | Executor, plan: SweepPlan) -> AbstractContextManager[Jobs]:
-    """The executor that is asked for: ``NAME``, ``NAME=PLACE``, or a pool of the caller's own.
-
-    Raises ``UsageError`` and ``EnvironmentFault``.
-    """
-    if isinstance(wanted, Executor):
-        if plan.count is not None:
-            raise UsageError("jobs: the executor that is given decides how many runs go on at once")
-        return nullcontext(PoolJobs(wanted))
-    name, equals, place = wanted.partition("=")
-    executor = EXECUTORS.load(name)
-    if equals and not (place and executor.place):
-        what = f"give {name}={executor.place}" if executor.place else f"give {name} alone"
-        raise UsageError(f"--executor {wanted}: {what}")
-    return executor.open(place or None, plan)
 
 
 def not_installed(package: str, extra: str) -> EnvironmentFault:
@@ -155,18 +26,6 @@ def not_installed(package: str, extra: str) -> EnvironmentFault:
     )
 
 
-class LocalExecutor(SweepExecutor):
-    """Runs on this machine, one after the other, or ``--jobs`` at once."""
-
-    name = "local"
-
-    @contextmanager
-    def open(self, place: str | None, plan: SweepPlan) -> Iterator[Jobs]:
-        # A run is processes of its own: its launcher has enough with a thread.
-        with ThreadPoolExecutor(plan.count or 1, thread_name_prefix="neuros-sweep") as pool:
-            yield PoolJobs(pool)
-
-
 class DaskExecutor(SweepExecutor):
     """Runs on the workers of a Dask scheduler; without an address, on workers of this machine."""
 
@@ -174,7 +33,7 @@ class DaskExecutor(SweepExecutor):
     place = "ADDRESS"
 
     @contextmanager
-    def open(self, place: str | None, plan: SweepPlan) -> Iterator[Jobs]:
+    def open(self, place: str | None, plan: SweepPlan) -> Iterator[Executor]:
         try:
             from distributed import Client
         except ImportError as error:
@@ -197,10 +56,10 @@ class DaskExecutor(SweepExecutor):
                     f"no Dask scheduler answers at {place} ({error}): give the address that it"
                     " printed, as tcp://10.0.0.7:8786, or its scheduler file"
                 ) from error
-            _check_versions(client)
+            _check_versions(client, plan.distribution)
             workers = client.scheduler_info(n_workers=-1)["workers"].values()
             resources = _resources_for(plan, [worker["resources"] for worker in workers])
-            yield PoolJobs(client.get_executor(pure=False, resources=resources))
+            yield client.get_executor(pure=False, resources=resources)
 
 
 @contextmanager
@@ -223,14 +82,15 @@ def _local_cluster(count: int | None) -> Iterator[Any]:
         yield cluster
 
 
-def _check_versions(client: Any) -> None:
+def _check_versions(client: Any, distribution: str) -> None:
     """Check that each worker has the NeuROS of this process. Raises ``EnvironmentFault``."""
     # A function of Python itself: what a worker cannot import would have it wait for ever.
-    found = client.run(version, "neuros", on_error="return")
-    here = version("neuros")
+    found = client.run(version, distribution, on_error="return")
+    here = version(distribution)
     for worker, there in found.items():
         if there != here:
-            has = "no NeuROS" if isinstance(there, Exception) else f"NeuROS {there}"
+            is_missing = isinstance(there, Exception)
+            has = f"no {distribution}" if is_missing else f"{distribution} {there}"
             raise EnvironmentFault(
                 f"executor dask: the worker {worker} has {has}, and this machine {here}: install"
                 " the same there, in the Python that runs dask worker"
@@ -258,5 +118,4 @@ def _resources_for(plan: SweepPlan, declared: Sequence[Mapping[str, float]]) -> 
     return asked
 
 
-LOCAL = LocalExecutor()
 DASK = DaskExecutor()

@@ -23,15 +23,9 @@ from types import FrameType
 from typing import Any
 
 from neuros.errors import EnvironmentFault
-from neuros.executors.executor import (
-    Job,
-    JobResources,
-    Jobs,
-    SweepExecutor,
-    SweepPlan,
-    not_installed,
-)
+from neuros.executors.executor import not_installed
 from neuros.installation.machine import answer_of
+from neuros.ports import Job, JobResources, Jobs, SweepExecutor, SweepPlan
 
 FOLDER = ".slurm"
 """Logs, jobs and results, in the folder of the sweep."""

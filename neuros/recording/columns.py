@@ -1,31 +1,23 @@
-"""Recorded messages as columns of NumPy, and as the libraries of scientists have them.
+"""Recorded messages as columns of NumPy.
 
 NumPy takes columns from the bytes of messages. In messages of fixed size, a number is always at the
 same place; in those with strings and sequences, it depends on their lengths, and most topics repeat
 a few lengths for ever, as of a ``frame_id``. So a layout is worked out from one message, and serves
 all that have the same lengths (plain CDR: OMG DDSI-RTPS 2.5, 10.2).
-
-xarray, Neo and Neurodata Without Borders are given columns. Units are those that the definitions of
-ROS messages state (REP 103); a field whose unit depends on something else, as the position of a
-joint, has none. Neo and NWB count in seconds of simulated time. A span without spikes is part of
-the recording, too: trains begin where the first packet's span does at the latest, and end with the
-stamp of the last packet.
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from rosbags.typesys.store import Typestore
 
-from neuros.errors import EnvironmentFault, UsageError
-from neuros.project.dashboard import SPIKES
+from neuros.errors import EnvironmentFault
 
 Column: TypeAlias = npt.NDArray[Any]
 """Values of one field, a row per packet."""
@@ -41,31 +33,7 @@ _NUMBERS = {
 _EMPTY = "structure_needs_at_least_one_member"
 _BASE, _NAME, _ARRAY = 1, 2, 3
 _MOST_LAYOUTS = 64
-_UNITS = {
-    "builtin_interfaces/msg/Duration": {"sec": "s", "nanosec": "ns"},
-    "builtin_interfaces/msg/Time": {"sec": "s", "nanosec": "ns"},
-    "geometry_msgs/msg/Accel": {"linear": "m/s^2", "angular": "rad/s^2"},
-    "geometry_msgs/msg/Pose": {"position": "m"},
-    "geometry_msgs/msg/Transform": {"translation": "m"},
-    "geometry_msgs/msg/Twist": {"linear": "m/s", "angular": "rad/s"},
-    "geometry_msgs/msg/Wrench": {"force": "N", "torque": "N m"},
-    "sensor_msgs/msg/FluidPressure": {"fluid_pressure": "Pa", "variance": "Pa^2"},
-    "sensor_msgs/msg/Illuminance": {"illuminance": "lx", "variance": "lx^2"},
-    "sensor_msgs/msg/Imu": {"angular_velocity": "rad/s", "linear_acceleration": "m/s^2"},
-    "sensor_msgs/msg/LaserScan": {
-        **dict.fromkeys(("angle_min", "angle_max", "angle_increment"), "rad"),
-        **dict.fromkeys(("time_increment", "scan_time"), "s"),
-        **dict.fromkeys(("range_min", "range_max", "ranges"), "m"),
-    },
-    "sensor_msgs/msg/MagneticField": {"magnetic_field": "T"},
-    "sensor_msgs/msg/Range": {
-        "field_of_view": "rad",
-        **dict.fromkeys(("min_range", "max_range", "range"), "m"),
-    },
-    "sensor_msgs/msg/Temperature": {"temperature": "degC", "variance": "degC^2"},
-}
-# By encoding: the type of a pixel's values, and its channels.
-_PIXELS = {
+PIXELS = {
     **{name: ("u1", tuple(name[:-1])) for name in ("rgb8", "bgr8", "rgba8", "bgra8")},
     "rgb16": ("u2", tuple("rgb")),
     "bgr16": ("u2", tuple("bgr")),
@@ -76,7 +44,7 @@ _PIXELS = {
     "16UC1": ("u2", ()),
     "32FC1": ("f4", ()),
 }
-Floats = npt.NDArray[np.float64]
+"""By encoding of images: the type of a pixel's values, and its channels."""
 
 
 class _Irregular(Exception):
@@ -210,7 +178,8 @@ def _columns_of_none(type_name: str, store: Typestore) -> dict[str, Column]:
     try:
         layout = _Layout(_CDR_HEADER, type_name, store.fielddefs)
     except _Irregular:
-        return {name: np.empty(0, object) for name, _ in _fields(type_name, store.fielddefs)}
+        ways = fields_of(type_name, store.fielddefs)
+        return {".".join(name for _, name in way): np.empty(0, object) for way in ways}
     numbers = {name: np.zeros((0, *kind.shape), kind.base) for name, kind, _ in layout.numbers}
     return numbers | {name: np.zeros(0, "U1") for name, _, _ in layout.texts}
 
@@ -280,17 +249,6 @@ def _join(parts: Sequence[tuple[npt.NDArray[np.intp], Column]], count: int) -> C
     return objects
 
 
-class Topic(Protocol):
-    """A recorded topic."""
-
-    name: str
-    type: str
-    connection: str | None
-
-    def columns(self) -> dict[str, Column]:
-        """Its fields, by name, and the two times."""
-
-
 def library(name: str, otherwise: str = "") -> Any:
     """An optional library.
 
@@ -312,56 +270,16 @@ def has_simulated_time(columns: Mapping[str, Column]) -> bool:
     return bool(np.any(columns[PUBLISH_TIME] != columns[LOG_TIME]))
 
 
-def dataset_of(topic: Topic, types: Mapping[str, Any], start_ns: int) -> Any:
-    """What :meth:`RecordedTopic.xarray` gives; ``start_ns``: wall time of the bag's first packet.
-
-    Args:
-        types: the field definitions of the bag's types.
-    """
-    xr = library("xarray", "array()")
-    columns = topic.columns()
-    is_simulated = has_simulated_time(columns)
-    wall_ns, sim_ns = columns.pop(LOG_TIME), columns.pop(PUBLISH_TIME)
-    if is_simulated:
-        time_s, clock = sim_ns / 1e9, "simulated time"
-    else:
-        time_s, clock = (wall_ns - start_ns) / 1e9, "wall time since the first packet of the bag"
-    found = dict(_fields(topic.type, types))
-    variables: dict[str, Any] = {}
-    coordinates: dict[str, Any] = {
-        "time": ("time", time_s, {"units": "s", "long_name": clock}),
-        "wall_time": ("time", wall_ns.astype("datetime64[ns]")),
-    }
-    images = [name for name, (of, _) in found.items() if of == IMAGE and name.endswith("data")]
-    for name in images:
-        prefix = name.removesuffix("data")
-        if (pixels := pixels_of(columns, prefix)) is not None:
-            dims = [f"{prefix}{dim}" for dim in ("y", "x", "channel")][: pixels.ndim - 1]
-            variables[name] = (("time", *dims), pixels)
-            if pixels.ndim == 4:
-                channels = list(_PIXELS[str(columns[f"{prefix}encoding"][0])][1])
-                coordinates[dims[2]] = (dims[2], channels)
-            del columns[name]
-    for name, column in columns.items():
-        unit = found.get(name, ("", None))[1]
-        dims = [f"{name}_{axis}" for axis in range(column.ndim - 1)]
-        free = f"{name}_" if name in coordinates else name
-        variables[free] = (("time", *dims), column, {"units": unit} if unit else {})
-    label = {"connection": topic.connection} if topic.connection else {}
-    return xr.Dataset(variables, coordinates, {"topic": topic.name, "type": topic.type, **label})
-
-
-def _fields(
-    type_name: str, types: Mapping[str, Any], prefix: str = "", unit: str | None = None
-) -> Iterator[tuple[str, tuple[str, str | None]]]:
-    """Of each field, with dots: the type that has it, and its unit where one is known."""
-    units = _UNITS.get(type_name, {})
+def fields_of(
+    type_name: str, types: Mapping[str, Any], path: tuple[tuple[str, str], ...] = ()
+) -> Iterator[tuple[tuple[str, str], ...]]:
+    """The way to each field: message types from the outermost on, with the field of each."""
     for name, (_, details) in types[type_name][1]:
-        its = units.get(name, unit)
+        way = (*path, (type_name, name))
         if isinstance(details, str) and details in types:
-            yield from _fields(details, types, f"{prefix}{name}.", its)
+            yield from fields_of(details, types, way)
         elif not name.startswith(_EMPTY):
-            yield f"{prefix}{name}", (type_name, its)
+            yield way
 
 
 def pixels_of(columns: Mapping[str, Column], prefix: str) -> Column | None:
@@ -370,10 +288,10 @@ def pixels_of(columns: Mapping[str, Column], prefix: str) -> Column | None:
     about = [columns[f"{prefix}{name}"] for name in ("height", "width", "step", "is_bigendian")]
     encodings = columns[f"{prefix}encoding"]
     varies = any(len(np.unique(column)) != 1 for column in (encodings, *about))
-    if data.ndim != 2 or varies or str(encodings[0]) not in _PIXELS:
+    if data.ndim != 2 or varies or str(encodings[0]) not in PIXELS:
         return None
     height, width, step, is_bigendian = (int(column[0]) for column in about)
-    kind, channels = _PIXELS[str(encodings[0])]
+    kind, channels = PIXELS[str(encodings[0])]
     value = np.dtype(kind).newbyteorder(">" if is_bigendian else "<")
     used = width * max(1, len(channels)) * value.itemsize
     if step < used or data.shape[1] != height * step:
@@ -381,52 +299,3 @@ def pixels_of(columns: Mapping[str, Column], prefix: str) -> Column | None:
     rows = np.ascontiguousarray(data.reshape(len(data), height, step)[:, :, :used])
     pixels: Column = rows.view(value).astype(value.newbyteorder("="), copy=False)
     return pixels.reshape((len(data), height, width, *([len(channels)] if channels else [])))
-
-
-@dataclass(frozen=True)
-class SpikeTrains:
-    """The spikes of a recorded population.
-
-    Attributes:
-        times_s: by neuron, the times of its spikes, rising.
-        start_s, end_s: what was recorded.
-    """
-
-    times_s: list[Floats]
-    start_s: float
-    end_s: float
-
-
-def trains_of(topic: Topic) -> SpikeTrains:
-    """The spikes of a topic.
-
-    Raises:
-        UsageError: if its type is another one, it has no packet, the size of the population
-            changes, or a packet has a neuron outside of it or not one time for each sender.
-    """
-    if topic.type != SPIKES:
-        raise UsageError(f"{topic.name} has packets of {topic.type}: spike trains need {SPIKES}")
-    columns = topic.columns()
-    sizes = columns["size"]
-    if not len(sizes):
-        raise UsageError(f"{topic.name} has no packet, so the size of its population is unknown")
-    size = int(sizes[0])
-    senders, times = (_joined(columns[name]) for name in ("senders", "times"))
-    if np.any(sizes != size):
-        raise UsageError(f"{topic.name}: the population has {size} neurons, then {sizes.max()}")
-    if len(senders) != len(times):
-        raise UsageError(f"{topic.name}: {len(senders)} senders, but {len(times)} times")
-    if np.any(senders >= size):
-        raise UsageError(f"{topic.name}: a spike of neuron {senders.max():g} among {size}")
-    stamps_s = columns["header.stamp.sec"] + columns["header.stamp.nanosec"] * 1e-9
-    start_s = min(0.0, *times[:1], *stamps_s[:1])
-    end_s = max(float(times.max(initial=start_s)), float(stamps_s.max()))
-    order = np.lexsort((times, senders))
-    places = np.searchsorted(senders[order], np.arange(1, size))
-    return SpikeTrains(np.split(times[order], places), start_s, end_s)
-
-
-def _joined(column: npt.NDArray[Any]) -> Floats:
-    """The elements of all packets: a row each, or objects where they have different lengths."""
-    parts = [np.asarray(each, np.float64).ravel() for each in column]
-    return np.concatenate(parts) if parts else np.zeros(0)

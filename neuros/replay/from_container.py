@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from neuros.analysis.run_record import PastRun
+from neuros.api.run_record import PastRun
 from neuros.errors import EnvironmentFault, NeurosError
 from neuros.ports import BackEnd
 from neuros.project.model import Folders, NodeFile

@@ -16,8 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from neuros.analysis.comparison import differing_fields
-from neuros.analysis.recorded_node import RecordedNode
+from neuros.api.verify import differing_fields
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import (
     Player,
@@ -33,6 +32,7 @@ from neuros.node.context import ContextSwitch
 from neuros.node.node import NodeRuntime
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
+from neuros.replay.recorded_node import RecordedNode
 from neuros.transport.envelope import Traffic
 from neuros.transport.messages import RosPackets
 from neuros.transport.null_middleware import HeldLoop, NullMiddleware

@@ -14,7 +14,7 @@ from benchmarks.reproduce.headdirection import KIND, LEARNING, PARTS, SERIES, TR
 from benchmarks.reproduce.kinds import WEIGHTS, Reading
 from benchmarks.reproduce.page import Section
 from benchmarks.reproduce.tables import Table
-from neuros.analysis.run_record import FORMAT
+from neuros.api.run_record import FORMAT
 from neuros.cli.main import main
 from neuros.errors import UsageError
 

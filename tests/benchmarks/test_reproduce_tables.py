@@ -17,7 +17,7 @@ from benchmarks.reproduce.kinds import Reading
 from benchmarks.reproduce.load import load_between
 from benchmarks.reproduce.tables import Layout, Ours, Published, Remark, spread_text
 from benchmarks.reproduce.whiskeye_curves import head_direction
-from neuros.analysis.run_record import FORMAT
+from neuros.api.run_record import FORMAT
 
 MS = 1_000_000
 

@@ -13,19 +13,21 @@ from typing import Any
 
 import pytest
 from api_projects import dice
+from neuros_analysis.sweep import open_executor
 
 import neuros
 from neuros.api.run import Run
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.executors.executor import JobResources, SweepPlan, _resources_for, open_executor
+from neuros.executors.executor import _resources_for
 from neuros.executors.slurm import _parameters
+from neuros.ports import JobResources, SweepPlan
 
 FACES = "nodes.thrower.environment.FACES"
 GIBIBYTE = 1 << 30
 
 
 def plan(folder: Path, count: int | None = None, **needs: Any) -> SweepPlan:
-    return SweepPlan("dice", folder, count, JobResources(**needs))
+    return SweepPlan("dice", folder, count, JobResources(**needs), "neuros")
 
 
 def needs_of(folder: Path, *nodes: dict[str, Any]) -> JobResources:
@@ -72,7 +74,7 @@ def test_dask_is_asked_for_what_its_workers_declare(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("wanted", "count", "reason"),
     [
-        ("slum", None, r"executor 'slum': choose one of local, slurm, dask .*'slurm'"),
+        ("slum", None, r"executor 'slum': choose one of slurm, dask, local .*'slurm'"),
         ("local=here", None, "give local alone"),
         ("dask=", None, "give dask=ADDRESS"),
         ("dask=tcp://10.0.0.7:8786", 2, "the workers there decide how many"),
@@ -120,7 +122,7 @@ class Instant(Executor):
         self._record = record
 
     def submit(self, job: Callable[..., Any], /, *_: Any, **__: Any) -> Future[Any]:
-        from neuros.api.sweep import SweepJob, row_of
+        from neuros_analysis.sweep import SweepJob, row_of
 
         assert isinstance(job, SweepJob)
         job.folder.mkdir()
@@ -154,7 +156,7 @@ def test_a_front_end_reads_no_run_folder_twice_and_writes_the_table_now_and_then
     record = project.run(backend="in-process", output=tmp_path / "one").folder / "run.json"
     table = tmp_path / "table"
 
-    def swept() -> neuros.Sweep:  # type: ignore[name-defined]
+    def swept() -> Any:
         executor = Instant(record)
         return neuros.sweep(project, set={FACES: range(1, 101)}, executor=executor, output=table)
 

@@ -25,14 +25,16 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
+from neuros_analysis.charts import load_figure
+from neuros_analysis.comparison import comparison_rows
+from neuros_analysis.findings import findings_of
+from neuros_analysis.review import open_for_review
+from neuros_analysis.run_pages import figures_of, panels_page, png, report_page, world_pages
+
 import neuros.bag
 from neuros import control
-from neuros.analysis.charts import load_figure
-from neuros.analysis.comparison import RecordedPackets, compare, comparison_rows
-from neuros.analysis.findings import findings_of
-from neuros.analysis.recorded_node import RecordedNode, recorded_node
-from neuros.analysis.run_pages import figures_of, panels_page, png, report_page, world_pages
-from neuros.analysis.run_record import open_for_review, open_run
+from neuros.api.run_record import open_run
+from neuros.api.verify import RecordedPackets, compare
 from neuros.cli.main import main
 from neuros.control.link import ControlLink, decode, encode, kind_of
 from neuros.control.steps import Advance, Advanced, StepLink
@@ -44,6 +46,7 @@ from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
 from neuros.recording.recorder import Recorder
+from neuros.replay.recorded_node import RecordedNode, recorded_node
 from neuros.transport.codecs import WrongBytes, cdr, message_codec
 from neuros.transport.envelope import DataTags, Positions, signed, verified
 from neuros.transport.large_packets import LargeInput, LargeOutput

@@ -87,12 +87,12 @@ def test_mcap_ros2_support_reads_the_very_numbers_that_were_sent(pipeline: Finis
     assert numbers == list(range(1, 201))
 
 
-def test_neuros_gives_arrays_and_frames(pipeline: Finished) -> None:
+def test_neuros_gives_arrays(pipeline: Finished) -> None:
     with neuros.bag.open(pipeline.run_folder) as bag:
         assert bag["source.number -> relay.number"].array()["data"].tolist() == [*range(1, 201)]
-        totals = bag["relay.total"].frame()
+        totals = bag["relay.total"].array()["data"].tolist()
         assert len(totals) == 200
-        assert totals["data"].is_monotonic_increasing
+        assert totals == sorted(totals)
         assert bag.custom["project"] == "pipeline"
         assert len(bag.custom["project_sha256"]) == 64
 
@@ -403,7 +403,6 @@ def test_whiskeye_is_recorded_whole(name: str, back_end: str, tmp_path: Path) ->
     sent = {c["connection"]: c["sent"] for c in finished.record["connections"]}
     assert {t["connection"]: t["recorded"] for t in recorded(finished).values()} == sent
     with neuros.bag.open(finished.run_folder) as bag:
-        imu = bag["robot.imu"].frame()
-    simulated_s = imu["publish_time_ns"] / 1e9
-    assert simulated_s.is_monotonic_increasing
-    assert simulated_s.iloc[-1] == pytest.approx(10.0, abs=0.1)
+        simulated_s = (bag["robot.imu"].array()["publish_time_ns"] / 1e9).tolist()
+    assert simulated_s == sorted(simulated_s)
+    assert simulated_s[-1] == pytest.approx(10.0, abs=0.1)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from recording.recordings import NUMBER, number, plan, record, spool
+from recordings import NUMBER, number, plan, record, spool
 
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from neuros.analysis.packets import read_packets
+from neuros.api.packets import read_packets
 from neuros.engine.event_log import LoggedEngine
 from neuros.engine.hook import Hook
 from neuros.engine.input_queue import Subscription

@@ -1,10 +1,9 @@
-"""What was recorded, as arrays and frames: the same numbers as rosbags reads one by one."""
+"""What was recorded, as arrays: the same numbers as rosbags reads one by one."""
 
 from __future__ import annotations
 
 import json
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recording.recordings import ANSWER, NUMBER, answer, number, plan, record, spool
+from recordings import ANSWER, NUMBER, answer, number, plan, record, spool
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -129,30 +128,6 @@ def test_a_bag_by_itself_is_opened(tmp_path: Path) -> None:
         assert bag[NUMBER.name].array()["data"].tolist() == [1]
 
 
-def test_a_frame_has_a_column_for_each_element(tmp_path: Path) -> None:
-    spool(tmp_path, "b", [(10, None, answer()), (30, None, answer())])
-    record(tmp_path, plan())
-    with neuros.bag.open(tmp_path) as bag:
-        frame = bag["/answer"].frame()
-    assert list(frame) == ["log_time_ns", "publish_time_ns", "data"]
-    assert frame["data"].tolist() == [0.0, 0.0]
-    assert frame.index.name == "time"
-    assert frame.index.astype("int64").tolist() == [10, 30]
-    assert str(frame.index.tz) == "UTC"
-
-
-def test_without_pandas_a_frame_says_what_to_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    record(tmp_path, plan())
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with (
-        neuros.bag.open(tmp_path) as bag,
-        pytest.raises(EnvironmentFault, match="pip install pandas"),
-    ):
-        bag["/answer"].frame()
-
-
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_topics_are_the_same_whichever_is_asked_for_first(tmp_path: Path, storage: str) -> None:
     spool(tmp_path, "a", [(wall, None, number(wall)) for wall in range(1, 40_001)])
@@ -175,7 +150,6 @@ def test_a_topic_without_packets_is_an_empty_array(tmp_path: Path) -> None:
         assert len(array) == 0
         assert array.dtype.names == ("log_time_ns", "publish_time_ns", "data")
         assert array["data"].dtype == np.float64
-        assert list(bag["/answer"].frame()) == list(array.dtype.names)
         assert bag["/answer"].count == 0
 
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from recording.recordings import NUMBER, number, plan, spool
+from recordings import NUMBER, number, plan, spool
 
 import neuros.bag
-from neuros.analysis.comparison import RecordedPackets
+from neuros.api.verify import RecordedPackets
 from neuros.bag import Bag
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault

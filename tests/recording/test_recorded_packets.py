@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recording.recordings import NUMBER, number, plan, record, spool
+from recordings import NUMBER, number, plan, record, spool
 from xxhash import xxh3_64_intdigest
 
-from neuros.analysis.comparison import _LARGE_BYTES, RecordedPackets
+from neuros.api.verify import _LARGE_BYTES, RecordedPackets
 from neuros.transport.large_packets import LARGE_BYTES
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from recording.recordings import NUMBER, number, plan, record, spool
+from recordings import NUMBER, number, plan, record, spool
 from rosbags.rosbag2 import Reader
 
 import neuros.bag

@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from mcap.records import ChunkIndex, SummaryOffset
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
-from recording.recordings import ANSWER, NUMBER, answer, fail, number, plan, record, spool
+from recordings import ANSWER, NUMBER, answer, fail, number, plan, record, spool
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from neuros.analysis.run_record import PastRun
+from neuros.api.run_record import PastRun
 from neuros.replay.from_container import note_on_versions
 
 

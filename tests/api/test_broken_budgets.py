@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from neuros.analysis.run_record import broken_budgets, losses
+from neuros.api.run_record import broken_budgets, losses
 from neuros.project.model import Budgets
 
 CONNECTION = "robot.imu -> snn.imu"

@@ -1,4 +1,4 @@
-"""Lists that nodes of a run have written: times, digests and latencies of packets, executions.
+"""Lists that nodes of a run have written: times, digests and latencies of packets.
 
 Reads what :mod:`neuros.node.logs` writes. Both ends' times are of the monotonic clock
 of one machine, which all its processes share; the two ends of a connection on different machines
@@ -7,7 +7,6 @@ leave their lists in different run folders, and no latency is worked out for the
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +20,6 @@ from xxhash import xxh3_128_hexdigest
 from neuros.project.model import Connection
 from neuros.project.scanner import read_bytes
 
-_MOST_HOOKS = 10_000
 _COUNT = re.compile(r"[1-9][0-9]{0,17}")
 FOLDER = "packets"
 PERCENTILES = (50, 90, 99)
@@ -140,7 +138,7 @@ def read_packets(run_folder: Path, connection: Connection) -> Packets:
         _list(receiver / f"{index}.taken_ns", np.int64),
     )
     both = min(len(taken), len(taken_ns))
-    good = _up_to_first(taken[:both] < 1)
+    good = up_to_first(taken[:both] < 1)
     damaged = () if good == both else (receiver / f"{index}.taken",)
     sent_before, (sent_ns, sent) = _beside(
         _list(sender / f"{index}.sent_ns", np.int64), _list(sender / f"{index}.digests", np.uint64)
@@ -152,7 +150,7 @@ def read_packets(run_folder: Path, connection: Connection) -> Packets:
         received=received,
         taken=taken[:good],
         taken_ns=taken_ns[:good],
-        pauses_ns=_numbers(receiver / "pauses", np.int64, 2),
+        pauses_ns=numbers_of(receiver / "pauses", np.int64, 2),
         damaged=damaged,
         sent_before=sent_before,
         received_before=received_before,
@@ -168,7 +166,7 @@ def _beside(*lists: tuple[int, Numbers]) -> tuple[int, list[Numbers]]:
 
 def _list(file: Path, kind: Any) -> tuple[int, Numbers]:
     """How many entries of a list were not kept, and the others; of files without a gap."""
-    found, end = [_numbers(file, kind)], 0
+    found, end = [numbers_of(file, kind)], 0
     before = 0
     if not len(found[0]):  # it has gone, or there never was one
         names = (
@@ -176,7 +174,7 @@ def _list(file: Path, kind: Any) -> tuple[int, Numbers]:
         )
         before = min((int(name) for name in names if _COUNT.fullmatch(name)), default=0)
     end = before + len(found[0])
-    while end and len(more := _numbers(file.with_name(f"{file.name}.{end}"), kind)):
+    while end and len(more := numbers_of(file.with_name(f"{file.name}.{end}"), kind)):
         found.append(more)
         end += len(more)
     return before, found[0] if len(found) == 1 else np.concatenate(found)
@@ -229,67 +227,18 @@ def may_have_lost(figures: Mapping[str, Any]) -> bool:
     return is_best_effort and figures.get("sent") != figures.get("received")
 
 
-@dataclass(frozen=True)
-class Trace:
-    """First executions of a node's hooks; times of the monotonic clock, in nanoseconds.
-
-    Attributes:
-        hooks: name and kind of each hook that ran.
-        which: of each execution, its hook's place in ``hooks``, (executions,).
-        starts_ns, ends_ns: from when to when, (executions,).
-        credits: index of the connection, position and arrival of each acknowledgement, (n, 3).
-        damaged: files of which the rest is left out, from an entry that no node has written.
-    """
-
-    hooks: tuple[tuple[str, str], ...]
-    which: Numbers
-    starts_ns: Numbers
-    ends_ns: Numbers
-    credits: Numbers
-    damaged: tuple[Path, ...] = ()
-
-    @property
-    def is_running(self) -> Numbers:
-        """Which executions were not of initialise hooks, (executions,)."""
-        initialisers = [i for i, (_, kind) in enumerate(self.hooks) if kind == "initialise"]
-        found: Numbers = ~np.isin(self.which, initialisers)
-        return found
-
-
-def read_trace(folder: Path) -> Trace:
-    """Read the lists of a node; empty where there are none."""
-    executions = _numbers(folder / "executions", np.int64, 3)
-    which, starts_ns, ends_ns = executions.T
-    good = _up_to_first(
-        (which < 0) | (which >= _MOST_HOOKS) | (starts_ns < 0) | (ends_ns < starts_ns)
-    )
-    damaged = () if good == len(executions) else (folder / "executions",)
-    executions = executions[:good]
-    try:
-        hooks = json.loads(read_bytes(folder / "hooks.json"))
-        names = [(str(hook["name"]), str(hook["kind"])) for hook in hooks]
-    except (OSError, ValueError, TypeError, KeyError, RecursionError):
-        names = []
-    # A node that was killed may have listed a hook's execution, and not its name.
-    count = int(executions[:, 0].max()) + 1 if len(executions) else 0
-    names += [(f"hook {place + 1}", "function") for place in range(len(names), count)]
-    which, starts_ns, ends_ns = executions.T
-    arrivals = _numbers(folder / "credits", np.int64, 3)
-    return Trace(tuple(names), which, starts_ns, ends_ns, arrivals, damaged)
-
-
 def _is_in(numbers: Numbers, places: Numbers) -> Numbers:
     """Which places, from 1, are of one of the numbers."""
     found: Numbers = (places >= 1) & (places <= len(numbers))
     return found
 
 
-def _up_to_first(wrong: Numbers) -> int:
+def up_to_first(wrong: Numbers) -> int:
     """The number of rows in front of the first wrong one."""
     return int(np.argmax(wrong)) if wrong.any() else len(wrong)
 
 
-def _numbers(file: Path, kind: Any, columns: int = 1) -> Numbers:
+def numbers_of(file: Path, kind: Any, columns: int = 1) -> Numbers:
     """All complete rows; one number in each makes an array of one dimension."""
     try:
         data = read_bytes(file)

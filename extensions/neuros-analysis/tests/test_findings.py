@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from run_folders import accounting, run_folder
+from neuros_analysis.findings import Bottleneck, Findings, find_bottleneck, findings_of
+from neuros_analysis.review import open_for_review
+from run_folders import accounting, run_folder, wires
 
-from neuros.analysis.findings import Bottleneck, Findings, find_bottleneck, findings_of
-from neuros.analysis.run_record import open_for_review
 from neuros.engine.metrics import TimeBudget
-from neuros.project.model import Connection
 
 TEN_S = 10.0
 
@@ -25,16 +24,6 @@ def spent(
     idle: float = 0.0,
 ) -> TimeBudget:
     return TimeBudget({"hook": executing}, waiting or {}, blocked or {}, idle, 0.0)
-
-
-def wires(**limits: int | None) -> dict[str, Connection]:
-    """Connections ``a_b=0``: from output ``out`` of a to input ``in`` of b, and its limit."""
-    found = {}
-    for index, (ends, limit) in enumerate(limits.items()):
-        source, destination = ends.split("_")
-        connection = Connection(source, "out", destination, f"in_{source}", limit, 1, index)
-        found[str(connection)] = connection
-    return found
 
 
 def find(

@@ -24,9 +24,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from neuros.analysis import charts
-from neuros.analysis.findings import Findings
-from neuros.analysis.run_record import PastRun
 from neuros.bag import RecordedTopic, open_bag
 from neuros.errors import UsageError
 from neuros.node.logs import WORLD_LOG
@@ -34,6 +31,9 @@ from neuros.project.dashboard import ARRAYS, SPIKES
 from neuros.project.scanner import read_bytes
 from neuros.recording.columns import has_simulated_time
 from neuros.registry import back_end_of
+from neuros_analysis import charts
+from neuros_analysis.findings import Findings
+from neuros_analysis.review import ReviewedRun
 
 MOST_SPIKES = 2_000_000
 """Of one output; later ones are left out."""
@@ -56,7 +56,9 @@ def png(figure: Any) -> bytes:
     return buffer.getvalue()
 
 
-def report_page(run: PastRun, findings: Findings, figures: Mapping[str, tuple[str, bytes]]) -> str:
+def report_page(
+    run: ReviewedRun, findings: Findings, figures: Mapping[str, tuple[str, bytes]]
+) -> str:
     """The page of a run.
 
     Args:
@@ -79,7 +81,7 @@ def page(title: str, parts: Sequence[str]) -> str:
 
 def _filled(template: str, title: str, **values: str) -> str:
     """A page of one of the HTML files beside this module."""
-    text = (files("neuros") / "analysis" / template).read_text("utf-8")
+    text = (files("neuros_analysis") / template).read_text("utf-8")
     return Template(text).substitute(values, title=escape(title))
 
 
@@ -117,7 +119,7 @@ def figure_part(title: str, text: str, data: bytes) -> str:
     )
 
 
-def _facts(run: PastRun) -> str:
+def _facts(run: ReviewedRun) -> str:
     record = run.record
     parts = [str(record.get("reason") or "ended normally")]
     if record.get("sim_s") is not None:
@@ -130,7 +132,7 @@ def _facts(run: PastRun) -> str:
     return f"<p>{escape('; '.join(parts))}.</p>"
 
 
-def _connections(run: PastRun) -> str:
+def _connections(run: ReviewedRun) -> str:
     header = ["connection", "sent", "received", "consumed", "discarded", "lost",
               "longest discard", "rate / Hz", "median / ms", "99 % / ms", "max / ms"]  # fmt: skip
     counts = ("sent", "received", "consumed", "discarded", "lost", "longest_discard")
@@ -152,7 +154,7 @@ def _number(value: float | None, digits: int) -> str:
     return "?" if value is None else f"{value:,.{digits}f}"
 
 
-def _provenance(run: PastRun) -> str:
+def _provenance(run: ReviewedRun) -> str:
     record = run.record
     machine, versions = record.get("machine") or {}, record.get("versions") or {}
     git = record.get("git") or {}
@@ -186,7 +188,7 @@ def _machine(machine: Mapping[str, Any]) -> str:
     return ", ".join(str(part) for part in parts if part)
 
 
-_FIGURES: tuple[tuple[str, str, str, Callable[[PastRun], Any]], ...] = (
+_FIGURES: tuple[tuple[str, str, str, Callable[[ReviewedRun], Any]], ...] = (
     (
         "graph",
         "Nodes and connections",
@@ -241,7 +243,7 @@ _FIGURES: tuple[tuple[str, str, str, Callable[[PastRun], Any]], ...] = (
 )
 
 
-def figures_of(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
+def figures_of(run: ReviewedRun) -> dict[str, tuple[str, str, bytes]]:
     """By file name (without ending): title, what is seen, PNG; only what says something."""
     found = {}
     for name, title, text, draw in _FIGURES:
@@ -251,7 +253,7 @@ def figures_of(run: PastRun) -> dict[str, tuple[str, str, bytes]]:
     return found
 
 
-def panels_page(run: PastRun) -> str | None:
+def panels_page(run: ReviewedRun) -> str | None:
     """The page, ``None`` if the bag of the run has nothing that a panel draws.
 
     Raises:
@@ -319,7 +321,9 @@ def _compressed(data: bytes) -> str:
     return base64.b64encode(zlib.compress(data)).decode()
 
 
-def world_pages(run: PastRun, complain: Callable[[str], object] = lambda _: None) -> dict[str, str]:
+def world_pages(
+    run: ReviewedRun, complain: Callable[[str], object] = lambda _: None
+) -> dict[str, str]:
     """Pages by node, of those whose world was recorded.
 
     Args:

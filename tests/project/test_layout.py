@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from test_findings import wires
+from run_folders import wires
 
 from neuros.project.graph import Layout, lay_out
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 from launching import BACKENDS, EXAMPLES, launch
+from neuros_analysis.charts import time_budget_figure
+from neuros_analysis.review import open_for_review
 
-from neuros.analysis.charts import time_budget_figure
-from neuros.analysis.run_record import open_for_review
 from neuros.cli.main import main
 
 FIGURES = {"graph", "time_shares", "swim_lanes", "real_time", "packets", "latency"}

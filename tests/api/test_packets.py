@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuros.analysis.packets import Packets, packet_figures, read_packets
+from neuros.api.packets import Packets, packet_figures, read_packets
 from neuros.project.model import Connection
 
 MS = 1_000_000

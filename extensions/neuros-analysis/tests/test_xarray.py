@@ -1,20 +1,19 @@
-"""Recorded packets as frames by simulated time, and as xarray's datasets."""
+"""Recorded packets as frames, and as xarray's datasets."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from recording.recordings import ALSO, ANSWER, answer, number, plan, record, spool
+from neuros_analysis import frames
+from recordings import ALSO, ANSWER, answer, number, plan, record, spool
 from rosbags.typesys import Stores, get_typestore
 
 import neuros.bag
-from neuros.errors import EnvironmentFault, UsageError
-from neuros.recording.columns import dataset_of
+from neuros.errors import UsageError
 from neuros.recording.recording_plan import RecordingPlan, Stream, Topic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -52,6 +51,24 @@ def image(pixels: Any, encoding: str, padding: int = 0, *, is_bigendian: bool = 
     )
 
 
+def test_a_frame_has_a_column_for_each_element(tmp_path: Path) -> None:
+    spool(tmp_path, "b", [(10, None, answer()), (30, None, answer())])
+    record(tmp_path, plan())
+    with neuros.bag.open(tmp_path) as bag:
+        frame = bag["/answer"].frame()
+    assert list(frame) == ["log_time_ns", "publish_time_ns", "data"]
+    assert frame["data"].tolist() == [0.0, 0.0]
+    assert frame.index.name == "time"
+    assert frame.index.astype("int64").tolist() == [10, 30]
+    assert str(frame.index.tz) == "UTC"
+
+
+def test_a_frame_of_a_topic_without_packets_has_its_columns(tmp_path: Path) -> None:
+    record(tmp_path, plan())
+    with neuros.bag.open(tmp_path) as bag:
+        assert list(bag["/answer"].frame()) == ["log_time_ns", "publish_time_ns", "data"]
+
+
 def test_a_frame_by_simulated_time_has_it_as_its_index(tmp_path: Path) -> None:
     spool(tmp_path, "b", [(10, 2_000, answer()), (30, 4_000, answer())])
     record(tmp_path, plan(time_owner="b"))
@@ -66,18 +83,6 @@ def test_a_frame_by_simulated_time_that_a_run_lacks_says_so(tmp_path: Path) -> N
     record(tmp_path, plan())
     with neuros.bag.open(tmp_path) as bag, pytest.raises(UsageError, match="no simulated time"):
         bag[ALSO.name].frame(clock="sim")
-
-
-@pytest.mark.parametrize("name", ["pandas", "xarray"])
-def test_without_the_library_a_sentence_says_how_to_get_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    record(tmp_path, plan())
-    monkeypatch.setitem(sys.modules, name, None)
-    with neuros.bag.open(tmp_path) as bag:
-        read = {"pandas": bag["/answer"].frame, "xarray": bag["/answer"].xarray}[name]
-        with pytest.raises(EnvironmentFault, match=rf"pip install {name}, or use array\(\)$"):
-            read()
 
 
 def test_fields_are_variables_along_simulated_seconds_with_their_units(tmp_path: Path) -> None:
@@ -124,7 +129,7 @@ def test_without_simulated_time_seconds_count_from_the_first_packet_of_the_bag(
 def test_a_field_with_the_name_of_a_coordinate_keeps_its_values() -> None:
     columns = {name: np.array([5]) for name in ("log_time_ns", "publish_time_ns", "time")}
     topic = SimpleNamespace(name="/t", type="lab/msg/Lap", connection=None, columns=lambda: columns)
-    made = dataset_of(topic, {"lab/msg/Lap": ([], [("time", (None, ("int64", 0)))])}, 5)
+    made = frames.dataset(topic, {"lab/msg/Lap": ([], [("time", (None, ("int64", 0)))])}, 5)
     assert (made["time"].item(), made["time_"].item()) == (0.0, 5)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from neuros.analysis.run_record import run_record
+from neuros.api.run_record import run_record
 from neuros.control import Report
 from neuros.launcher.outcome import Outcome
 from neuros.project.load import load_project

@@ -8,8 +8,8 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from neuros.analysis.packets import FOLDER, read_packets
-from neuros.analysis.run_record import PastRun, open_run
+from neuros.api.packets import FOLDER, read_packets
+from neuros.api.run_record import PastRun, open_run
 from neuros.bag import Bag, open_bag
 from neuros.engine.event_log import is_understood
 from neuros.errors import EnvironmentFault, UsageError

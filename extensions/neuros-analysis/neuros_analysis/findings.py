@@ -21,9 +21,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from neuros.analysis.run_record import PastRun
 from neuros.engine.metrics import TimeBudget
 from neuros.project.model import Connection
+from neuros_analysis.review import ReviewedRun
 
 WORTH_NAMING = 0.02
 """Share of the time below which a cause is noise."""
@@ -240,7 +240,7 @@ class Findings:
     trial: str | None = None
 
 
-def findings_of(run: PastRun) -> Findings:
+def findings_of(run: ReviewedRun) -> Findings:
     """Say what limits a run."""
     budgets = run.time_budgets
     if not budgets or not run.running_s:
@@ -317,7 +317,7 @@ def _reason(step: Step, spent: TimeBudget) -> str:
     )
 
 
-def _caveats(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: float) -> list[str]:
+def _caveats(run: ReviewedRun, budgets: Mapping[str, TimeBudget], running_s: float) -> list[str]:
     cores = (run.record.get("machine") or {}).get("cores")
     machine = (run.record.get("system_load") or {}).get("machine")
     shares = [sum(sum(s.executing.values()) for s in budgets.values()) / running_s / (cores or 1)]
@@ -344,7 +344,7 @@ def _gain(gain: Gain, record: Mapping[str, Any]) -> str:
     return f"{text}. Packets may then be lost there."
 
 
-def _trial(gain: Gain, run: PastRun) -> str:
+def _trial(gain: Gain, run: ReviewedRun) -> str:
     settings = []
     for name in gain.connections:
         c = run.ends[name]
@@ -353,7 +353,7 @@ def _trial(gain: Gain, run: PastRun) -> str:
     return shlex.join(["neuros", "launch", str(run.record.get("file", "PROJECT")), *settings])
 
 
-def _one_process(run: PastRun, budgets: Mapping[str, TimeBudget], running_s: float) -> Findings:
+def _one_process(run: ReviewedRun, budgets: Mapping[str, TimeBudget], running_s: float) -> Findings:
     """One thread runs all hooks: none overlap, so that no node holds up another."""
     node, (hook, busy_s) = max(
         ((name, spent.busiest_hook) for name, spent in budgets.items()), key=lambda x: x[1][1]

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from needs import COMPILER, require
+from neuros_analysis.spikes import trains_of
 
 import neuros
 import neuros.bag
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.dashboard import SPIKES
-from neuros.recording.columns import trains_of
 from neuros.snn import Spikes
 
 PLUGIN = """

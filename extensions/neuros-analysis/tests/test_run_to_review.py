@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
+from neuros_analysis.review import open_for_review
 from run_folders import PACKETS, accounting, run_folder
 
-from neuros.analysis.run_record import open_for_review
 from neuros.errors import EnvironmentFault, UsageError
 
 WIRE = "a.out -> b.in"

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from neuros_analysis.review import open_for_review
 from run_folders import PACKETS, accounting, run_folder
 
-from neuros.analysis.run_record import open_for_review, open_run
+from neuros.api.run_record import open_run
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault
 from neuros.recording.recording_plan import load_plan

@@ -12,25 +12,28 @@ import os
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, wait
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from neuros.analysis.run_record import consumed_percent
+from tabulate import tabulate
+
 from neuros.api.live import LiveRun
 from neuros.api.plan import time_problems
 from neuros.api.project import Project, override_texts, value_text
-from neuros.api.request import Request, SweepOptions
-from neuros.api.run import Run, frame_of
+from neuros.api.request import Request
+from neuros.api.run import Run
+from neuros.api.run_record import consumed_percent
 from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
-from neuros.executors.executor import JobResources, Jobs, SweepPlan, open_executor
 from neuros.options import takes
+from neuros.ports import Job, JobResources, Jobs, SweepExecutor, SweepPlan
 from neuros.recording.run_file import RUN_FILE, read_object
-from neuros.registry import AUTO, BACK_ENDS
+from neuros.registry import AUTO, BACK_ENDS, EXECUTORS
+from neuros_analysis.options import SweepOptions
 
 _PLAN_NAME = "sweep.json"
 _LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
@@ -65,8 +68,10 @@ class Sweep:
         self.rows: list[dict[str, Any]] = []
 
     def frame(self) -> Any:
-        """A ``pandas.DataFrame``, one row per run. Raises ``EnvironmentFault``."""
-        return frame_of(self.rows)
+        """A ``pandas.DataFrame``, one row per run."""
+        from neuros_analysis.frames import table
+
+        return table(self.rows)
 
     def runs(self) -> list[Run]:
         """The runs that have begun, in the order of the rows."""
@@ -167,7 +172,7 @@ class _Sweeping:
         waiting = [name for name in self._jobs if not self._take_finished(name)]
         try:
             if waiting:
-                plan = SweepPlan(self._name, folder, options.jobs, resources)
+                plan = SweepPlan(self._name, folder, options.jobs, resources, "neuros-analysis")
                 with open_executor(options.executor, plan) as jobs:
                     self._execute(jobs, waiting)
         finally:
@@ -336,8 +341,6 @@ def _write_csv(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
 
 def _table_of(rows: Sequence[Mapping[str, Any]]) -> str:
     """For people: without folders, times and counts."""
-    from tabulate import tabulate
-
     hidden = ("folder", "wall_s", "sim_s")
     names = [n for n in _columns_of(rows) if n not in hidden and not n.endswith(_COUNTS)]
     names = [name for name in names if any(_is_shown(row.get(name)) for row in rows)]
@@ -362,6 +365,55 @@ def _cell(name: str, value: Any) -> str:
     if name == "reason" and len(text) > _REASON_CHARACTERS:
         return text[: _REASON_CHARACTERS - 3] + "..."
     return text
+
+
+# ---------------------------------------------------------------------- executors
+
+
+class LocalExecutor(SweepExecutor):
+    """Runs on this machine, one after the other, or ``--jobs`` at once."""
+
+    name = "local"
+
+    def open(self, place: str | None, plan: SweepPlan) -> Executor:
+        # A run is processes of its own: its launcher has enough with a thread.
+        return ThreadPoolExecutor(plan.count or 1, thread_name_prefix="neuros-sweep")
+
+
+LOCAL = LocalExecutor()
+
+
+class _PoolJobs:
+    """The jobs of a pool of :mod:`concurrent.futures`."""
+
+    def __init__(self, pool: Executor) -> None:
+        self._pool = pool
+
+    def submit(self, jobs: Sequence[Job]) -> list[Future[Any]]:
+        return [self._pool.submit(job) for job in jobs]
+
+    def cancel(self) -> None:
+        """Nothing: a job that begins now returns at once."""
+
+
+@contextlib.contextmanager
+def open_executor(wanted: str | Executor, plan: SweepPlan) -> Iterator[Jobs]:
+    """The executor that is asked for: ``NAME``, ``NAME=PLACE``, or a pool of the caller's own.
+
+    Raises ``UsageError`` and ``EnvironmentFault``.
+    """
+    if isinstance(wanted, Executor):
+        if plan.count is not None:
+            raise UsageError("jobs: the executor that is given decides how many runs go on at once")
+        yield _PoolJobs(wanted)
+        return
+    name, equals, place = wanted.partition("=")
+    executor = EXECUTORS.load(name)
+    if equals and not (place and executor.place):
+        what = f"give {name}={executor.place}" if executor.place else f"give {name} alone"
+        raise UsageError(f"--executor {wanted}: {what}")
+    with executor.open(place or None, plan) as opened:
+        yield _PoolJobs(opened) if isinstance(opened, Executor) else opened
 
 
 # ---------------------------------------------------------------------- points

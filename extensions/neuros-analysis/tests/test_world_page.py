@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from neuros_analysis import run_pages
+from neuros_analysis.review import ReviewedRun
 
-from neuros.analysis import run_pages
-from neuros.analysis.run_record import PastRun
 from neuros.node.logs import WORLD_LOG, WorldLog
 
 POSE = base64.b64encode(bytes(28))
@@ -49,13 +49,13 @@ class Logger:
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> PastRun:
+def run(tmp_path: Path) -> ReviewedRun:
     (tmp_path / "robot").mkdir()
-    return PastRun(tmp_path, {"nodes": {"robot": {}, "brain": {}}})
+    return ReviewedRun(tmp_path, {"nodes": {"robot": {}, "brain": {}}})
 
 
 @pytest.fixture
-def log(run: PastRun) -> WorldLog:
+def log(run: ReviewedRun) -> WorldLog:
     return WorldLog(run.folder / "robot", Logger())  # type: ignore[arg-type]
 
 
@@ -63,7 +63,7 @@ def fail(complaint: str) -> None:
     raise AssertionError(complaint)
 
 
-def scenes(run: PastRun, complain: Callable[[str], object] = fail) -> list[dict[str, Any]]:
+def scenes(run: ReviewedRun, complain: Callable[[str], object] = fail) -> list[dict[str, Any]]:
     """What the page of the robot holds."""
     found = run_pages.world_pages(run, complain)
     assert [*found] == ["robot"]
@@ -75,11 +75,13 @@ def scenes(run: PastRun, complain: Callable[[str], object] = fail) -> list[dict[
     return found
 
 
-def test_a_run_without_a_recorded_world_has_no_page(run: PastRun) -> None:
+def test_a_run_without_a_recorded_world_has_no_page(run: ReviewedRun) -> None:
     assert run_pages.world_pages(run) == {}
 
 
-def test_frames_are_in_their_order_and_geometry_is_kept_once(run: PastRun, log: WorldLog) -> None:
+def test_frames_are_in_their_order_and_geometry_is_kept_once(
+    run: ReviewedRun, log: WorldLog
+) -> None:
     world = World()
     for bundle in range(3):
         world.at(bundle, bundle), world.at(bundle + 0.5, bundle + 0.5)
@@ -90,7 +92,7 @@ def test_frames_are_in_their_order_and_geometry_is_kept_once(run: PastRun, log: 
     assert (run.folder / "robot" / WORLD_LOG).read_text().count("geometry") == 1
 
 
-def test_each_geometry_has_its_own_frames(run: PastRun, log: WorldLog) -> None:
+def test_each_geometry_has_its_own_frames(run: ReviewedRun, log: WorldLog) -> None:
     world = World()
     for sim_s, world.version in enumerate(("1", "2", "1")):
         world.at(sim_s, sim_s)
@@ -101,7 +103,7 @@ def test_each_geometry_has_its_own_frames(run: PastRun, log: WorldLog) -> None:
 
 
 def test_what_stands_still_is_one_frame_and_time_goes_on_after_a_reset(
-    run: PastRun, log: WorldLog
+    run: ReviewedRun, log: WorldLog
 ) -> None:
     world = World()
     for sim_s in (0, 1, 1, 1, 2, 0.5, 1.5):
@@ -113,7 +115,7 @@ def test_what_stands_still_is_one_frame_and_time_goes_on_after_a_reset(
 
 
 def test_of_a_long_recording_every_kth_frame_is_shown(
-    run: PastRun, log: WorldLog, monkeypatch: pytest.MonkeyPatch
+    run: ReviewedRun, log: WorldLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run_pages, "MOST_FRAMES", 4)
     world = World()
@@ -148,7 +150,7 @@ def test_of_a_long_recording_every_kth_frame_is_shown(
     ids=lambda line: line[:40].decode("ascii", "replace"),
 )
 def test_what_comes_before_a_damage_is_shown_and_the_damage_is_named(
-    run: PastRun, log: WorldLog, line: bytes
+    run: ReviewedRun, log: WorldLog, line: bytes
 ) -> None:
     world = World()
     world.at(0, 0)
@@ -160,19 +162,19 @@ def test_what_comes_before_a_damage_is_shown_and_the_damage_is_named(
     assert complaints == [f"the rest of {run.folder / 'robot' / WORLD_LOG}: the file is damaged"]
 
 
-def test_a_world_without_frames_has_no_page(run: PastRun) -> None:
+def test_a_world_without_frames_has_no_page(run: ReviewedRun) -> None:
     (run.folder / "robot" / WORLD_LOG).write_text('{"geometry": "{}", "frames": []}')
     assert run_pages.world_pages(run, fail) == {}
 
 
-def test_frames_without_a_geometry_are_no_world(run: PastRun) -> None:
+def test_frames_without_a_geometry_are_no_world(run: ReviewedRun) -> None:
     complaints: list[str] = []
     (run.folder / "robot" / WORLD_LOG).write_text('{"frames": [[0, 1.0, "AAAA"]]}')
     assert run_pages.world_pages(run, complaints.append) == {}
     assert len(complaints) == 1
 
 
-def test_a_world_is_a_file_and_no_pipe(run: PastRun) -> None:
+def test_a_world_is_a_file_and_no_pipe(run: ReviewedRun) -> None:
     complaints: list[str] = []
     os.mkfifo(run.folder / "robot" / WORLD_LOG)
     assert run_pages.world_pages(run, complaints.append) == {}

@@ -1,4 +1,4 @@
-"""Figures of one run: its graph, times, packets, latencies, timeline, ticks and load."""
+"""Figures of a run: its graph, times, packets, latencies, timeline, ticks and load; of several."""
 
 from __future__ import annotations
 
@@ -7,12 +7,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Patch
+from matplotlib.ticker import MaxNLocator
 
-from neuros.analysis.packets import Numbers
-from neuros.analysis.run_record import PastRun, read_load
+from neuros.api.packets import Numbers
 from neuros.engine.metrics import TimeBudget
 from neuros.project.graph import Place, guarantee, lay_out, port_names
 from neuros.recording.system_load import FILE_NAME
+from neuros_analysis.comparison import figures_of, labels_of
+from neuros_analysis.review import ReviewedRun, read_load
 
 # Okabe and Ito, Color Universal Design (2008).
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
@@ -34,7 +40,6 @@ def colour(index: int) -> str:
 
 def new_figure(height_in: float, width_in: float = _WIDTH_IN) -> Any:
     """An empty ``matplotlib`` figure; no window, no global state."""
-    from matplotlib.figure import Figure
 
     return Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
 
@@ -64,7 +69,7 @@ def _stacked_bars(names: Sequence[str], parts: Mapping[str, tuple[str, Any]]) ->
     return figure, axes
 
 
-def time_budget_figure(run: PastRun) -> Any | None:
+def time_budget_figure(run: ReviewedRun) -> Any | None:
     """Time budgets of all nodes; ``None`` if none has reported."""
     budgets = run.time_budgets
     if not budgets:
@@ -82,7 +87,7 @@ def time_budget_figure(run: PastRun) -> Any | None:
     return figure
 
 
-def counts_figure(run: PastRun) -> Any | None:
+def counts_figure(run: ReviewedRun) -> Any | None:
     """Packets of every connection: consumed, unread, discarded, lost."""
     names = list(run.connections)[::-1]
     if not names:
@@ -104,7 +109,7 @@ def _count(value: int | None) -> str:
     return "?" if value is None else f"{value:,}"
 
 
-def latency_figure(run: PastRun) -> Any | None:
+def latency_figure(run: ReviewedRun) -> Any | None:
     """The share of packets on which a hook had started after a time; ``None`` without lists."""
     curves = {}
     for name in run.packets:
@@ -126,7 +131,7 @@ def latency_figure(run: PastRun) -> Any | None:
     return figure
 
 
-def ticks_figure(run: PastRun) -> Any | None:
+def ticks_figure(run: ReviewedRun) -> Any | None:
     """Histograms of the intervals of timed hooks; ``None`` if there are none."""
     ticks = [
         (f"{node}.{hook}", figures["ticks"])
@@ -144,7 +149,6 @@ def ticks_figure(run: PastRun) -> Any | None:
 
 
 def _draw_ticks(axes: Any, name: str, ticks: Mapping[str, Any]) -> None:
-    from matplotlib.ticker import MaxNLocator
 
     from_ms, counts = zip(*ticks["histogram"], strict=True)
     low, high = min(from_ms), max(from_ms) + 0.1
@@ -163,7 +167,7 @@ def _draw_ticks(axes: Any, name: str, ticks: Mapping[str, Any]) -> None:
     axes.set(xlabel="interval between starts / ms", ylabel="intervals")
 
 
-def time_figure(run: PastRun) -> Any | None:
+def time_figure(run: ReviewedRun) -> Any | None:
     """Simulated against wall time, and the real-time factor of each second; ``None`` without."""
     timelines = {
         name: points for name, points in run.record.get("timeline", {}).items() if len(points) > 1
@@ -189,7 +193,7 @@ def time_figure(run: PastRun) -> Any | None:
     return figure
 
 
-def load_figure(run: PastRun) -> Any | None:
+def load_figure(run: ReviewedRun) -> Any | None:
     """Processor and memory of every node; ``None`` if nothing was recorded."""
     series = read_load(run.folder / FILE_NAME)
     if not series.get("time_s"):
@@ -217,7 +221,7 @@ _COLUMN_IN, _ROW_IN = 2.45, 1.12
 _NODE, _BOX = (1.75, 0.8), (2.05, 0.8)
 
 
-def graph_figure(run: PastRun) -> Any | None:
+def graph_figure(run: ReviewedRun) -> Any | None:
     """Nodes with how they spent their time, connections with what they carried and how fast."""
     if not run.nodes:
         return None
@@ -253,7 +257,7 @@ def _at(place: Place) -> tuple[float, float]:
     return place.column * _COLUMN_IN, -place.row * _ROW_IN
 
 
-def _shade(run: PastRun, name: str) -> str:
+def _shade(run: ReviewedRun, name: str) -> str:
     """Red where the sender was held up for long."""
     spent = run.time_budgets.get(run.ends[name].source_node)
     if spent and run.running_s and spent.blocked.get(name, 0.0) > 0.1 * run.running_s:
@@ -265,7 +269,6 @@ def _draw_route(
     axes: Any, route: Sequence[Place], widths: Mapping[Place, float], shade: str, is_dotted: bool
 ) -> None:
     """A line from the sender's side to the receiver's; its end has the arrow."""
-    from matplotlib.patches import FancyArrowPatch
 
     for number, (a, b) in enumerate(itertools.pairwise(route)):
         (x, y), (to_x, to_y) = _at(a), _at(b)
@@ -280,7 +283,7 @@ def _draw_route(
         axes.add_patch(line)
 
 
-def _draw_box(axes: Any, run: PastRun, name: str, place: Place) -> None:
+def _draw_box(axes: Any, run: ReviewedRun, name: str, place: Place) -> None:
     x, y = _at(place)
     _rectangle(axes, x, y, _BOX, "white", _shade(run, name))
     connection, figures = run.ends[name], run.connections[name]
@@ -330,8 +333,6 @@ def _draw_node(axes: Any, name: str, place: Place, spent: TimeBudget | None) -> 
 
 
 def _draw_key(axes: Any, rows: float) -> None:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
 
     handles = [
         *(Patch(color=shade, label=state) for state, shade in _STATES.items()),
@@ -348,7 +349,6 @@ def _draw_key(axes: Any, rows: float) -> None:
 def _rectangle(
     axes: Any, x: float, y: float, size: tuple[float, float], face: str, edge: str
 ) -> None:
-    from matplotlib.patches import FancyBboxPatch
 
     width, height = size
     axes.add_patch(
@@ -376,7 +376,7 @@ _CROWD = 60
 """Lines of a kind above which they are drawn finer."""
 
 
-def timeline_figure(run: PastRun) -> Any | None:
+def timeline_figure(run: ReviewedRun) -> Any | None:
     """The first second in which all nodes ran, and a part of it enlarged; ``None`` without lists.
 
     A lane of hooks for each node, packets and acknowledgements between them.
@@ -399,7 +399,7 @@ def timeline_figure(run: PastRun) -> Any | None:
     return figure
 
 
-def _hook_colours(run: PastRun, nodes: list[str]) -> _Colours:
+def _hook_colours(run: ReviewedRun, nodes: list[str]) -> _Colours:
     """A colour for each hook; those of initialise hooks, which are seldom seen, come last."""
     hooks = [(name, *each) for name in nodes for each in run.traces[name].hooks]
     hooks.sort(key=lambda each: each[2] == "initialise")
@@ -407,7 +407,7 @@ def _hook_colours(run: PastRun, nodes: list[str]) -> _Colours:
     return {each: _HOOKS[place % len(_HOOKS)] for place, each in enumerate(names)}
 
 
-def _close_look_ns(run: PastRun, start_ns: int) -> int:
+def _close_look_ns(run: ReviewedRun, start_ns: int) -> int:
     """A length that shows a dozen packets of the busiest connection."""
     shortest = _SECOND_NS
     for packets in run.packets.values():
@@ -417,7 +417,7 @@ def _close_look_ns(run: PastRun, start_ns: int) -> int:
     return max(shortest, 1_000)
 
 
-def _draw(axes: Any, run: PastRun, colours: _Colours, start_ns: int, length_ns: int) -> None:
+def _draw(axes: Any, run: ReviewedRun, colours: _Colours, start_ns: int, length_ns: int) -> None:
     nodes = [name for name in run.nodes if name in run.traces]
     row = {name: len(nodes) - 1 - place for place, name in enumerate(nodes)}
     for name in nodes:
@@ -446,9 +446,8 @@ def _draw(axes: Any, run: PastRun, colours: _Colours, start_ns: int, length_ns: 
 
 
 def _draw_packets(
-    axes: Any, run: PastRun, name: str, rows: tuple[int, int], window: tuple[int, int]
+    axes: Any, run: ReviewedRun, name: str, rows: tuple[int, int], window: tuple[int, int]
 ) -> None:
-    from matplotlib.collections import LineCollection
 
     sender, receiver = rows
     if sender == receiver:
@@ -469,13 +468,13 @@ def _draw_packets(
             axes.add_collection(lines)
 
 
-def _flights(run: PastRun, name: str, window: tuple[int, int]) -> Numbers | None:
+def _flights(run: ReviewedRun, name: str, window: tuple[int, int]) -> Numbers | None:
     """Milliseconds of sending and of the start on it, for packets of the window, (n, 2)."""
     flights_ns = run.flights_ns(name)
     return None if flights_ns is None or not len(flights_ns) else _within(flights_ns, window)
 
 
-def _answers(run: PastRun, name: str, window: tuple[int, int]) -> Numbers | None:
+def _answers(run: ReviewedRun, name: str, window: tuple[int, int]) -> Numbers | None:
     """Milliseconds of acknowledgements: from the start on a packet to when its sender knew.
 
     They are cumulative: one is drawn from the last packet that it counts.
@@ -501,9 +500,7 @@ def _within(times_ns: Numbers, window: tuple[int, int]) -> Numbers:
     return found
 
 
-def _legend(figure: Any, run: PastRun, colours: _Colours) -> None:
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
+def _legend(figure: Any, run: ReviewedRun, colours: _Colours) -> None:
 
     kinds = {(n, hook): kind for n, trace in run.traces.items() for hook, kind in trace.hooks}
     handles: list[Any] = [
@@ -516,3 +513,45 @@ def _legend(figure: Any, run: PastRun, colours: _Colours) -> None:
         Line2D([], [], color=ORANGE, linestyle=_DASHES, label="acknowledgement"),
     ]
     add_legend(figure, 3, handles=handles)
+
+
+def comparison_figure(runs: Sequence[ReviewedRun]) -> Any | None:
+    """Real-time factor, consumed packets, latency, executing share; ``None`` if no run has any."""
+    found = figures_of(runs)
+    nothing: list[float | None] = [None for _ in runs]
+    connections = dict.fromkeys(name for run in runs for name in run.connections)
+    nodes = dict.fromkeys(name for run in runs for name in run.nodes)
+    panels = {
+        "real-time factor": {"": "real-time factor"},
+        "packets consumed / %": {name: f"{name}: consumed / %" for name in connections},
+        "median latency / ms": {name: f"{name}: median latency / ms" for name in connections},
+        "executing / % of the time": {name: f"{name}: executing / %" for name in nodes},
+    }
+    panels = {
+        title: rows for title, rows in panels.items() if any(key in found for key in rows.values())
+    }
+    if not panels:
+        return None
+    bar = 0.8 / len(runs)
+    heights = [max(1.0, len(rows) * (0.2 + 0.16 * len(runs))) for rows in panels.values()]
+    figure = new_figure(sum(heights) + 0.75 * len(panels) + 0.4)
+    ratios = {"height_ratios": heights}
+    all_axes = figure.subplots(len(panels), squeeze=False, gridspec_kw=ratios)[:, 0]
+    for axes, (title, rows) in zip(all_axes, panels.items(), strict=True):
+        places = np.arange(len(rows))[::-1]
+        for number, label in enumerate(labels_of(runs)):
+            values = [found.get(key, nothing)[number] for key in rows.values()]
+            offsets = places + 0.4 - bar * (number + 0.5)
+            lengths, height = [value or 0.0 for value in values], bar * 0.92
+            bars = axes.barh(offsets, lengths, height, color=colour(number), label=label)
+            texts = [" ?" if value is None else f" {value:.3g}" for value in values]
+            axes.bar_label(bars, texts, fontsize=7)
+        plain(axes).set_yticks(places, [*rows], fontsize=8)
+        if [*rows] == [""]:
+            axes.tick_params(axis="y", length=0)
+        axes.set_title(title, fontsize=10, loc="left")
+        axes.margins(x=0.1)
+        axes.grid(visible=False, axis="y")
+    handles, labels = all_axes[0].get_legend_handles_labels()
+    add_legend(figure, 4, handles=handles, labels=labels)
+    return figure

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from neuros_analysis.sweep import Point, parse_values, points_of, short_names
 
-from neuros.api.sweep import Point, parse_values, points_of, short_names
 from neuros.errors import UsageError
 
 RATE = "nodes.robot.environment.RATE"

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neuros.analysis.comparison import Verdict, compare, differing_fields
-from neuros.analysis.run_record import PastRun, open_run, open_whole
+from neuros.api.run_record import PastRun, open_run, open_whole
+from neuros.api.verify import Verdict, compare, differing_fields
 from neuros.errors import EnvironmentFault, UsageError
 
 FIRST, SECOND = "a.out -> b.in", "b.out -> c.in"

@@ -1,0 +1,85 @@
+"""Options of ``neuros sweep``, which are arguments of :func:`neuros.sweep`, too."""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentTypeError
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from neuros.api.request import Request
+from neuros.options import like, option, positive_number
+from neuros.registry import EXECUTORS
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+OnRow: TypeAlias = "Callable[[int, int, Mapping[str, Any]], None]"
+
+
+def _seeds(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise ArgumentTypeError(f"'{text}': give whole numbers, as in 1,2,3") from None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SweepOptions:
+    """Options of ``neuros sweep``, which are arguments of :func:`sweep`."""
+
+    set: Mapping[str, Any] | Sequence[str] | None = option(
+        "--set",
+        is_repeatable=True,
+        metavar="PATH=VALUE,...",
+        help="set a key of the project, as launch does, to each of these values; commas separate"
+        " them, but not within brackets or quotes",
+    )
+    seeds: Iterable[int] = option(
+        "--seeds",
+        parse=_seeds,
+        default=(),
+        metavar="SEED,...",
+        default_help="as in the files",
+        help="run with each of these seeds: every environment variable of a node with SEED in its"
+        " name gets the seed",
+    )
+    repeat: int = option(
+        "--repeat", parse=positive_number, default=1, metavar="N", help="runs of each combination"
+    )
+    executor: str | Executor = option(
+        "--executor",
+        default="local",
+        suggestions=lambda: EXECUTORS,
+        metavar="NAME",
+        page="python.md#sweeps-on-a-cluster",
+        help="where the runs are made: local (this machine), slurm or slurm=PARTITION (an array"
+        " of Slurm jobs), dask=ADDRESS (Dask workers), dask (Dask workers on this machine); other"
+        " Python packages may add executors, and Python programs may pass any executor of"
+        " concurrent.futures",
+    )
+    jobs: int | None = option(
+        "--jobs",
+        parse=positive_number,
+        metavar="N",
+        default_help="1 with local, else as many as there is room for",
+        help="number of runs at the same time; they share the processors, so their real-time"
+        " factors mean little",
+    )
+    retry: bool = option(
+        "--retry", default=False, help="repeat the runs that failed in an earlier call"
+    )
+    backend: str | None = like(Request, "backend")
+    duration: float | str | None = like(Request, "duration")
+    record: bool | Sequence[str] = like(Request, "record", group="")
+    output: str | os.PathLike[str] | None = option(
+        "-o",
+        "--output",
+        metavar="DIR",
+        default_help="runs/<project>/sweep-<utc time>",
+        help="write into this folder: a new one, or that of an earlier call, to continue its sweep",
+    )
+    on_row: OnRow | None = option(
+        help="called with the number of a run, of how many, and its row", is_recorded=False
+    )

@@ -1,0 +1,272 @@
+"""A run as it is reviewed: what there is of it, and what is missing.
+
+Of a run that goes on, was cut off, or is of an earlier version, :func:`open_for_review` reads what
+there is; :func:`neuros.api.run_record.open_run` refuses these.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neuros.api.packets import (
+    FOLDER,
+    Numbers,
+    Packets,
+    may_have_lost,
+    numbers_of,
+    packet_figures,
+    read_packets,
+    up_to_first,
+)
+from neuros.api.run_record import PastRun, connection_of
+from neuros.engine.metrics import TimeBudget, time_budget_of
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.project.scanner import read_bytes
+from neuros.recording.run_file import RUN_FILE, check_record, read_object, read_run_file
+from neuros.recording.system_load import FILE_NAME
+from neuros.registry import ran_in_one_process
+
+_MOST = 2.0**63  # of what is measured; a figure cannot have axes of any length
+_MOST_HOOKS = 10_000
+
+
+@dataclass(frozen=True)
+class Trace:
+    """First executions of a node's hooks; times of the monotonic clock, in nanoseconds.
+
+    Attributes:
+        hooks: name and kind of each hook that ran.
+        which: of each execution, its hook's place in ``hooks``, (executions,).
+        starts_ns, ends_ns: from when to when, (executions,).
+        credits: index of the connection, position and arrival of each acknowledgement, (n, 3).
+        damaged: files of which the rest is left out, from an entry that no node has written.
+    """
+
+    hooks: tuple[tuple[str, str], ...]
+    which: Numbers
+    starts_ns: Numbers
+    ends_ns: Numbers
+    credits: Numbers
+    damaged: tuple[Path, ...] = ()
+
+    @property
+    def is_running(self) -> Numbers:
+        """Which executions were not of initialise hooks, (executions,)."""
+        initialisers = [i for i, (_, kind) in enumerate(self.hooks) if kind == "initialise"]
+        found: Numbers = ~np.isin(self.which, initialisers)
+        return found
+
+
+def read_trace(folder: Path) -> Trace:
+    """Read the lists of a node; empty where there are none."""
+    executions = numbers_of(folder / "executions", np.int64, 3)
+    which, starts_ns, ends_ns = executions.T
+    good = up_to_first(
+        (which < 0) | (which >= _MOST_HOOKS) | (starts_ns < 0) | (ends_ns < starts_ns)
+    )
+    damaged = () if good == len(executions) else (folder / "executions",)
+    executions = executions[:good]
+    try:
+        hooks = json.loads(read_bytes(folder / "hooks.json"))
+        names = [(str(hook["name"]), str(hook["kind"])) for hook in hooks]
+    except (OSError, ValueError, TypeError, KeyError, RecursionError):
+        names = []
+    # A node that was killed may have listed a hook's execution, and not its name.
+    count = int(executions[:, 0].max()) + 1 if len(executions) else 0
+    names += [(f"hook {place + 1}", "function") for place in range(len(names), count)]
+    which, starts_ns, ends_ns = executions.T
+    arrivals = numbers_of(folder / "credits", np.int64, 3)
+    return Trace(tuple(names), which, starts_ns, ends_ns, arrivals, damaged)
+
+
+@dataclass(frozen=True)
+class ReviewedRun(PastRun):
+    """A run, with what pages and figures show of it.
+
+    Attributes:
+        missing: a sentence for each thing that could not be told.
+    """
+
+    missing: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name for headings."""
+        return f"{self.record.get('project', '?')} ({self.folder.name})"
+
+    @property
+    def running_s(self) -> float | None:
+        """Wall time in which all nodes ran."""
+        found: float | None = self.record.get("running_s")
+        return found
+
+    @property
+    def is_one_process(self) -> bool:
+        """Whether all nodes took turns in one thread."""
+        return ran_in_one_process(self.record)
+
+    @property
+    def time_owner(self) -> str | None:
+        """The node that owns simulated time."""
+        return next((n for n in self.nodes if self.nodes[n].get("sim_time") is not None), None)
+
+    @cached_property
+    def time_budgets(self) -> dict[str, TimeBudget]:
+        """Time budget of each node that has reported."""
+        found = {name: time_budget_of(node, self.running_s) for name, node in self.nodes.items()}
+        return {name: spent for name, spent in found.items() if spent is not None}
+
+    @cached_property
+    def packets(self) -> dict[str, Packets]:
+        """The packet lists of every connection."""
+        return {name: read_packets(self.folder, end) for name, end in self.ends.items()}
+
+    def flights_ns(self, connection: str) -> Numbers | None:
+        """When a packet was sent, and when a hook started on it, for each start, if known."""
+        may_lose = may_have_lost(self.connections[connection])
+        return self.packets[connection].flights_ns(may_lose=may_lose)
+
+    def latencies_ns(self, connection: str) -> Numbers | None:
+        """Nanoseconds from the sending of a packet to each start of a hook on it, if known."""
+        may_lose = may_have_lost(self.connections[connection])
+        return self.packets[connection].latencies_ns(may_lose=may_lose)
+
+    @cached_property
+    def traces(self) -> dict[str, Trace]:
+        """The first executions of every node that has listed them."""
+        found = {name: self.trace(name) for name in self.nodes}
+        return {name: trace for name, trace in found.items() if len(trace.starts_ns)}
+
+    def trace(self, node: str) -> Trace:
+        """The first executions of a node, as far as it has listed them."""
+        return read_trace(self.folder / node / FOLDER)
+
+
+def open_for_review(folder: Path) -> ReviewedRun:
+    """Read what there is in a run folder.
+
+    Raises:
+        UsageError: if no run has left it behind, the run goes on, or another version wrote it.
+        EnvironmentFault: if it is damaged.
+    """
+    if (folder / RUN_FILE).exists():
+        record, missing = read_run_file(folder), list[str]()
+    else:
+        record, missing = _from_project(folder)
+    run = ReviewedRun(folder, record)
+    return replace(run, missing=(*missing, *_missing_lists(run)))
+
+
+def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
+    """A record from files that were written before and during the run."""
+    if not (folder / "project.json").is_file():
+        raise UsageError(f"{folder} has no run.json: it is not the folder of a run")
+    project = read_object(folder / "project.json")
+    try:
+        connections = [
+            {
+                "connection": "{source_node}.{source_output} -> {destination_node}"
+                ".{destination_input}".format_map(each),
+                "index": index,
+                "discard_limit": each.get("discard_limit"),
+                "queue_size": each.get("queue_size", 1),
+                "sent": None,
+                "received": None,
+                "consumed": None,
+            }
+            for index, each in enumerate(project.get("connections", ()))
+        ]
+        nodes = {str(node["name"]): {"report": None} for node in project.get("nodes", ())}
+    except (AttributeError, KeyError, TypeError) as error:
+        text = f"{folder / 'project.json'} is broken: it is not a project"
+        raise EnvironmentFault(text) from error
+    record = {
+        "project": folder.parent.name if folder.parent.parent.name == "runs" else folder.name,
+        "reason": "the run goes on, or its launcher was killed",
+        "connections": connections,
+        "nodes": nodes,
+        "expanded_project": project,
+    }
+    check_record(record, folder / "project.json")
+    for figures in connections:
+        packets = read_packets(folder, connection_of(figures))
+        figures["sent"] = packets.sent_before + len(packets.sent_ns)
+        figures["received"] = packets.received_before + len(packets.received)
+        if not packets.taken_before:  # several hooks may have started on one that is not listed
+            figures["consumed"] = len({*packets.taken.tolist()})
+        figures |= packet_figures(packets, may_lose=may_have_lost(figures))
+    return record, [
+        "run.json: the run goes on, or its launcher was killed. Packets are counted from the"
+        " nodes' lists (up to a second before the end); how nodes spent their time, losses and"
+        " ticks are not known, so neither is the bottleneck"
+    ]
+
+
+def _missing_lists(run: ReviewedRun) -> list[str]:
+    missing: list[str] = []
+    silent = [name for name, node in run.nodes.items() if not node.get("accounting")]
+    if silent and len(silent) < len(run.nodes):
+        missing.append(f"what {', '.join(silent)} did with its time: it never reported")
+    if not (run.folder / FILE_NAME).is_file():
+        missing.append("processor and memory: the run was made without -m")
+    read_load(run.folder / FILE_NAME, missing.append)
+    if (run.record.get("options") or {}).get("packet_log") == "0":
+        missing.append("times of single packets: the run was made with --packet-log 0")
+    elif not any(len(packets.sent_ns) for packets in run.packets.values()) and run.connections:
+        missing.append("times of single packets: no node has listed any")
+    missing += [
+        f"times and digests of the first {each.before} packets of {name}: they are not kept"
+        " (--packet-log)"
+        for name, each in run.packets.items()
+        if each.before
+    ]
+    if not run.traces and run.nodes:
+        missing.append("the first executions of hooks: no node has listed any")
+    damaged = [file for packets in run.packets.values() for file in packets.damaged]
+    damaged += [file for name in run.nodes for file in run.trace(name).damaged]
+    missing += [f"the rest of {file}: the file is damaged" for file in damaged]
+    return missing
+
+
+def read_load(
+    file: Path, complain: Callable[[str], object] = lambda _: None
+) -> dict[str, list[float]]:
+    """The columns of ``system_load.csv``, NaN where a cell is empty; none if there is no file.
+
+    Rows with what is no number are left out, as the last one of a run that was cut off.
+
+    Args:
+        complain: told if it is damaged; what comes before the damage is returned.
+    """
+    rows: list[list[str]] = []
+    try:
+        text = read_bytes(file).decode("utf-8", "replace")
+        rows.extend(csv.reader(io.StringIO(text, newline="")))
+    except FileNotFoundError:
+        return {}
+    except (OSError, csv.Error):
+        complain(f"the rest of {file}: the file is damaged")
+    header = rows.pop(0) if rows else []
+    series: dict[str, list[float]] = {name: [] for name in header}
+    memory = {name.replace(".cpu_percent", ".memory_bytes") for name in header}
+    if len(series) < len(header) or not memory <= {*header}:
+        complain(f"the figures in {file}: the file is damaged")
+        return {}
+    for row in rows:
+        try:
+            numbers = [float(cell) if cell else float("nan") for cell in row]
+        except ValueError:
+            continue
+        if len(numbers) == len(header) and not any(abs(each) > _MOST for each in numbers):
+            for name, number in zip(header, numbers, strict=True):
+                series[name].append(number)
+    return series

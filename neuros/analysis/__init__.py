@@ -1,1 +1,0 @@
-"""Analysis of runs: `run.json`, differences, budgets, reports and comparisons."""
