@@ -33,6 +33,7 @@ PAGES = sorted(
         ROOT / "CONTRIBUTING.md",
         *(ROOT / "docs").glob("*.md"),
         *(ROOT / "examples").rglob("README.md"),
+        *(ROOT / "extensions").glob("*/README.md"),
         ROOT / "workspace" / "README.md",
     ]
 )

@@ -69,13 +69,15 @@ def add_option_tables(app: Sphinx | None, page: str, source: list[str]) -> None:
 
 
 def _table(name: str, page: str) -> str:
-    """The options that a dataclass of :mod:`neuros.api.request` declares."""
-    from neuros.api import request
+    """The options of a command that a dataclass declares."""
+    from neuros_analysis.options import SweepOptions
+
+    from neuros.api.request import LaunchOptions, Request
     from neuros.options import options_of
 
-    declared_in = (request.Request, request.SweepOptions)
-    in_python = {each.name for cls in declared_in for each in options_of(cls)}
-    shown = [each for each in options_of(getattr(request, name)) if each.flags]
+    in_python = {each.name for cls in (Request, SweepOptions) for each in options_of(cls)}
+    declared_in = {cls.__name__: cls for cls in (LaunchOptions, SweepOptions)}
+    shown = [each for each in options_of(declared_in[name]) if each.flags]
     rows = [_option_row(each, page, in_python) for each in shown]
     head = ["| option | in Python | meaning | default |", "| --- | --- | --- | --- |"]
     return "\n".join([*head, *rows])

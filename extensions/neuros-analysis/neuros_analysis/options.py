@@ -53,7 +53,7 @@ class SweepOptions:
         default="local",
         suggestions=lambda: EXECUTORS,
         metavar="NAME",
-        page="python.md#sweeps-on-a-cluster",
+        page="../extensions/neuros-analysis/README.md#sweeps-on-a-cluster",
         help="where the runs are made: local (this machine), slurm or slurm=PARTITION (an array"
         " of Slurm jobs), dask=ADDRESS (Dask workers), dask (Dask workers on this machine); other"
         " Python packages may add executors, and Python programs may pass any executor of"
