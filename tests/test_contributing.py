@@ -179,7 +179,7 @@ def test_a_sensor_touches_one_file(checkout: Checkout) -> None:
         '<freejoint/><geom size="0.1" mass="2"/></body></worldbody></mujoco>'
     )
     program = (
-        f"import sys; sys.path.append({str(ROOT / 'tests/simulators')!r})\n"
+        f"import sys; sys.path.append({str(ROOT / 'tests/support')!r})\n"
         "from simulated_node import SimulatedNode\n"
         "from neuros.simulators.mujoco import MuJoCo\n"
         f"outputs = {{'energy': ('std_msgs/msg/Float64', {sensor})}}\n"

@@ -14,7 +14,9 @@ from sizes import (
     used_once_percent,
 )
 
-NEUROS, EXTENSIONS = ROOT / "neuros", ROOT / "extensions"
+NEUROS = ROOT / "neuros"
+EXTENSIONS = [*(ROOT / "extensions").glob("*/neuros_*")]
+TESTS = [ROOT / "tests", *(ROOT / "extensions").glob("*/tests")]
 SLACK = 0.02
 """A number that has fallen by more than this share takes its ceiling with it."""
 
@@ -26,15 +28,15 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 60_499)
+    hold("lines of neuros/", lines(NEUROS), 57_707)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, EXTENSIONS), 65_038)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 63_379)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(ROOT / "tests", ROOT / "benchmarks"), 77_000)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 78_737)
 
 
 def test_private_functions_that_are_used_once() -> None:

@@ -58,8 +58,8 @@ from neuros.viewers.dashboard.pages import Pages
 from neuros.viewers.dashboard.server import Dashboard
 from tests.message_packages import MANIFEST
 from tests.message_values import message_classes
-from tests.recording.recordings import NUMBER, number, plan, spool
 from tests.run_folders import accounting, run_folder
+from tests.support.recordings import NUMBER, number, plan, spool
 
 from .mutation import Mutate, change_bytes, change_json, change_text, change_xml, mixed
 
