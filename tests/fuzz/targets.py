@@ -243,8 +243,7 @@ def write_package(folder: Path, files: Mapping[str, bytes]) -> None:
 
 @cache
 def sdf_seeds() -> Sequence[bytes]:
-    here = HERE.parent / "simulators" / "convert"
-    return [(here / name).read_bytes() for name in ("everything.sdf",)]
+    return [(HERE.parents[1] / "extensions/neuros-robots/tests/everything.sdf").read_bytes()]
 
 
 @target(sdf_seeds, change_xml, change_bytes, change_text)

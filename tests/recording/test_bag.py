@@ -20,6 +20,7 @@ from neuros.bag import Bag
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.recording.columns import columns_of
+from neuros.registry import Registry
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types
@@ -126,6 +127,18 @@ def test_a_bag_by_itself_is_opened(tmp_path: Path) -> None:
     (tmp_path / "recording.json").unlink()
     with neuros.bag.open(tmp_path / "elsewhere") as bag:
         assert bag[NUMBER.name].array()["data"].tolist() == [1]
+
+
+def test_without_the_extension_that_makes_frames_an_error_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(tmp_path, plan())
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
+    formats: Registry[Any] = Registry("neuros.bag_formats", "format", object)
+    monkeypatch.setattr("neuros.bag.BAG_FORMATS", formats)
+    said = r"format 'frame' is in the extension neuros-analysis, .* install"
+    with neuros.bag.open(tmp_path) as bag, pytest.raises(UsageError, match=said):
+        bag["/answer"].frame()
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
