@@ -501,6 +501,19 @@ class Deployment(ABC):
     """A back end made ready for some nodes; defaults are for nodes that see files as we do."""
 
     notices: Sequence[Notice] = ()
+    places: Mapping[str, str] = {}
+    """The machine of each node that is not on this one."""
+
+    def connect(self, log: Callable[[str, str], None]) -> Sequence[str]:
+        """Reach the other machines and get them ready; returns their addresses.
+
+        Args:
+            log: takes lines for the user, as ``(severity, text)``, in any thread.
+
+        Raises:
+            EnvironmentFault: with all that went wrong; none of them is held any more then.
+        """
+        return ()
 
     @abstractmethod
     def launcher(self, program: NodeProgram) -> Launcher:
@@ -773,3 +786,31 @@ class BackEnd(ABC):
     def provenance(self, record: Mapping[str, Any]) -> Mapping[str, str]:
         """What reports show of :meth:`Deployment.record`, by heading."""
         return {}
+
+
+class DeploymentKind(ABC):
+    """How nodes run where a deployment file says, an entry point of ``neuros.deployments``."""
+
+    name: str
+
+    @abstractmethod
+    def prepare(
+        self,
+        file: Path,
+        project: Project,
+        here: Callable[[Sequence[Node]], Deployment],
+        *,
+        monitors_load: bool,
+    ) -> Deployment:
+        """A deployment of all nodes; raises ``ProjectError`` with all problems of the file.
+
+        ``here`` makes nodes ready that run on this machine; ``monitors_load``: whether the others
+        are to write their system load.
+        """
+
+    @abstractmethod
+    def checks(self, file: Path, *, proves: bool) -> Iterable[Finding]:
+        """What ``neuros doctor`` finds of the machines of a file; ``proves``: with nodes there.
+
+        Raises ``ProjectError``, too.
+        """

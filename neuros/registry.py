@@ -33,6 +33,7 @@ from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.ports import (
     BackEnd,
     Deployment,
+    DeploymentKind,
     ModelFormat,
     Notice,
     SimulatorKind,
@@ -168,6 +169,9 @@ AUTO = "auto"
 """In place of the name of a back end: the best one that can be used."""
 
 BACK_ENDS: Registry[BackEnd] = Registry("neuros.backends", "back end", BackEnd, further=[AUTO])
+DEPLOYMENTS: Registry[DeploymentKind] = Registry(
+    "neuros.deployments", "--deployment on", DeploymentKind
+)
 TRANSPORTS: Registry[TransportKind] = Registry("neuros.transports", "transport", TransportKind)
 SUBCOMMANDS: Registry[Subcommand] = Registry("neuros.commands", "command", Subcommand)
 NAMES: Registry[Any] = Registry("neuros.names", "name in neuros", object)

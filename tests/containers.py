@@ -16,7 +16,6 @@ from needs import cannot_run
 
 from neuros.backends.docker.engine import connect
 from neuros.backends.docker.images import images_for
-from neuros.backends.docker.remote import VOLUME
 from neuros.errors import EnvironmentFault
 
 IMAGES = ("neuros_python", "neuros_mujoco", "neuros_nest")
@@ -67,7 +66,7 @@ def nothing_left(folder: Path) -> Iterator[DockerClient]:
     def things() -> set[str]:
         volumes = engine.api.volumes()["Volumes"] or []
         containers = engine.api.containers(all=True, filters={"label": "neuros.run_folder"})
-        return {volume["Name"] for volume in volumes} - {VOLUME} | {
+        return {volume["Name"] for volume in volumes} - {"neuros_agent"} | {
             f"{container['Names'][0]} ({container['Status']})"
             for container in containers
             if Path(container["Labels"]["neuros.run_folder"]).is_relative_to(folder)

@@ -24,7 +24,6 @@ from neuros.errors import NeurosError
 from neuros.installation.machine import NEWEST, NEWEST_FOR_NEST, OLDEST, dotted
 from neuros.options import Option
 from neuros.options import options_of as declared_options
-from neuros.project.deployment import load_deployment
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(
@@ -32,6 +31,7 @@ PAGES = sorted(
         ROOT / "README.md",
         ROOT / "CONTRIBUTING.md",
         *(ROOT / "docs").glob("*.md"),
+        *(ROOT / "extensions").glob("*/README.md"),
         *(ROOT / "examples").rglob("README.md"),
         *(ROOT / "extensions").glob("*/README.md"),
         ROOT / "workspace" / "README.md",
@@ -225,15 +225,6 @@ def test_every_project_shown_is_valid(tmp_path: Path) -> None:
         except NeurosError as error:
             wrong.append(f"{named(page)}: {error}")
     assert not wrong
-
-
-def test_every_deployment_shown_is_valid(tmp_path: Path) -> None:
-    shown = [json.loads(body) for page in PAGES for body in blocks(page, "json")]
-    deployments = [content for content in shown if isinstance(content.get("nodes"), dict)]
-    assert deployments
-    for content in deployments:
-        (tmp_path / "deployment.json").write_text(json.dumps(content))
-        load_deployment(tmp_path / "deployment.json")
 
 
 def test_every_code_block_says_its_language() -> None:

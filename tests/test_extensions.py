@@ -16,7 +16,7 @@ from test_architecture import imports_of
 from neuros.cli.main import main
 from neuros.distribution import __version__, libraries
 from neuros.errors import UsageError
-from neuros.ports import ModelFormat
+from neuros.ports import DeploymentKind, ModelFormat
 from neuros.registry import EXTENSIONS, Registry
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -100,6 +100,22 @@ def test_so_is_that_of_a_command(
         main(["convert", "robot.urdf"])
     assert ended.value.code == 2
     assert "command 'convert' is in the extension neuros-robots" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command", [["launch", str(ROOT / "examples/1_tick/clock")], ["doctor", "--no-delivery"]]
+)
+def test_so_is_that_of_a_deployment(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
+    registry: Registry[DeploymentKind] = Registry(
+        "neuros.deployments", "--deployment on", DeploymentKind
+    )
+    for name in ("neuros.api.plan.DEPLOYMENTS", "neuros.registry.DEPLOYMENTS"):
+        monkeypatch.setattr(name, registry)
+    assert main([*command, "--deployment", "lab.json"]) == 2
+    assert "'machines' is in the extension neuros-cluster, which is" in capsys.readouterr().err
 
 
 def test_a_python_elsewhere_finds_extensions_where_the_core_says(tmp_path: Path) -> None:

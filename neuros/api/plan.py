@@ -22,13 +22,12 @@ from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError, p
 from neuros.installation.progress import Progress, Stream
 from neuros.messages.needed import Messages
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Notice
-from neuros.project.deployment import load_deployment
 from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.project.names import SESSION
 from neuros.project.scanner import problem_in
 from neuros.project.split import split
 from neuros.project.validate import nest_conflicts
-from neuros.registry import AUTO, Chosen, choose
+from neuros.registry import AUTO, BACK_ENDS, DEPLOYMENTS, Chosen, choose
 from neuros.transport.dds_profile import (
     MOST_LOCAL_PARTICIPANTS,
     PEERS_VARIABLE,
@@ -38,8 +37,8 @@ from neuros.transport.dds_profile import (
 
 _HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")  # RFC 1123
 _ON_MACHINES = "process"
-_LISTS = 5  # of packets for each connection, at both ends: see neuros.node.logs
 """The back end of nodes on other machines, and of all nodes of a deployment."""
+_LISTS = 5  # of packets for each connection, at both ends: see neuros.node.logs
 _LOOKS_LIKE_AN_ADDRESS = re.compile(r"[\d.]+")
 
 
@@ -122,7 +121,6 @@ class Plan:
 
     Attributes:
         is_held: for a session.
-        places: the machine of each node that does not run on this one.
     """
 
     project: Project
@@ -133,7 +131,6 @@ class Plan:
     network: Network = THIS_MACHINE
     messages: Messages | None = None
     is_held: bool = False
-    places: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def elsewhere(self) -> tuple[str, ...]:
@@ -154,6 +151,11 @@ class Plan:
     def deployment(self) -> Deployment:
         """The back end made ready for them."""
         return self.chosen.deployment
+
+    @property
+    def places(self) -> Mapping[str, str]:
+        """The machine of each node that does not run on this one."""
+        return self.deployment.places
 
     @property
     def notices(self) -> list[Notice]:
@@ -237,28 +239,18 @@ def make_plan(
     network = chosen_network(request.network, request.peers)
     names = _chosen_names(project, request.nodes)
     nodes = [project.node(name) for name in names]
-    wanted, machines = request.backend or AUTO, None
-    places: Mapping[str, str] = {}
-    if request.deployment is not None:
-        _check_deployment(request)
-        file = load_deployment(Path(request.deployment), project)
-        places = file.places
-        nodes = [node for node in nodes if node.name not in places]
-        wanted, network = _ON_MACHINES, Network(bool(places))
-    chosen = choose(wanted, project, nodes, request.backend_options or {})
-    if request.deployment is not None:
-        from neuros.backends.machines.deployment import Machines
-
-        machines = Machines(
-            file, project, chosen.deployment, monitors_load=request.monitor_system_load
-        )
-        chosen = replace(chosen, deployment=machines)
+    if request.deployment is None:
+        chosen = choose(request.backend or AUTO, project, nodes, request.backend_options or {})
+    else:
+        chosen = _choose_machines(project, Path(request.deployment), request)
+        nodes = [node for node in nodes if node.name not in chosen.deployment.places]
+        network = Network(bool(chosen.deployment.places))
     back_end = chosen.back_end
     if back_end.is_one_process:
         _check_reach(project, names, back_end)
     has_pythons = not (back_end.is_one_process or back_end.has_own_pythons)
     pythons = Pythons.choose(nodes if has_pythons else [], project.folder, os.environ)
-    plan = Plan(project, names, chosen, request, pythons, network, messages, places=places)
+    plan = Plan(project, names, chosen, request, pythons, network, messages)
     if back_end.is_one_process and network.is_wide and plan.is_partial:
         raise UsageError(
             f"--network with -n: the nodes of the {back_end.name} back end cannot reach nodes"
@@ -271,13 +263,12 @@ def make_plan(
         raise ProjectError(problems)
     if is_tried:
         check_machine(plan, os.environ)
-        if machines is not None:
-            machines.connect(_say)
-            plan = replace(plan, network=replace(network, peers=machines.peers))
+        peers = (*network.peers, *plan.deployment.connect(_say))
+        plan = replace(plan, network=replace(network, peers=peers))
     return plan
 
 
-def _check_deployment(request: Request) -> None:
+def _choose_machines(project: Project, file: Path, request: Request) -> Chosen:
     """A deployment says itself where nodes run, and how these reach each other."""
     others = {
         "-n": request.nodes,
@@ -291,6 +282,14 @@ def _check_deployment(request: Request) -> None:
             f"--deployment with {', '.join(given)}: the deployment file says where nodes run (in"
             " processes) and how they reach each other; leave that out"
         )
+    options = request.backend_options or {}
+    deployment = DEPLOYMENTS.load("machines").prepare(
+        file,
+        project,
+        lambda here: choose(_ON_MACHINES, project, here, options).deployment,
+        monitors_load=request.monitor_system_load,
+    )
+    return Chosen(BACK_ENDS.load(_ON_MACHINES), deployment)
 
 
 def _say(severity: str, text: str) -> None:

@@ -1,8 +1,6 @@
-"""``neuros launch`` and ``export``: runs with console, signals, and exit code.
+"""``neuros launch``: runs with console, signals, and exit code.
 
 What runs projects is imported late: ``--help`` and completion read this module, too.
-
-``neuros part`` is what the containers of an exported project start.
 """
 
 from __future__ import annotations
@@ -18,11 +16,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.api.request import FORMS, ExportOptions, LaunchOptions, Request
+from neuros.api.request import LaunchOptions
 from neuros.cli import EXIT_CODES
 from neuros.cli.common import add_project, load_with_messages
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
-from neuros.options import add_options, options_of, parsed_as, values_of
+from neuros.options import add_options, parsed_as, values_of
 from neuros.registry import AUTO, BACK_ENDS
 
 if TYPE_CHECKING:
@@ -216,59 +214,3 @@ def signals_noted() -> Iterator[tuple[list[int], socket.socket]]:
             signal.signal(number, signal.SIG_IGN if is_over else handler)
         reader.close()
         writer.close()
-
-
-_OF_PARTS = ("domain_id", "peers", "peer_timeout", "duration", "output", "verbose")
-_PART_OPTIONS = [each for each in options_of(Request) if each.name in _OF_PARTS]
-_CODES_OF_SIGNALS = {2: 130, 15: 143, 1: 143}
-
-
-def add_export(export: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
-    export.description = (
-        "Write the files with which Docker Compose or Kubernetes start a project, without NeuROS on"
-        " their machines; each node gets a container. Or write a batch script that launches the"
-        " project on Slurm."
-    )
-    export.add_argument("form", choices=FORMS, help="for which engine")
-    add_project(export, ExportOptions)
-    export.set_defaults(command=_export)
-
-
-def _export(parsed: argparse.Namespace) -> int:
-    from neuros.api.export import export
-    from neuros.cli.environments import build_messages
-
-    project, messages = load_with_messages(parsed)
-    if ended := build_messages(messages):
-        return ended
-    options = replace(parsed_as(ExportOptions, parsed), form=parsed.form)
-    print(export(project, messages.paths, options))
-    return 0
-
-
-def add_part(part: argparse.ArgumentParser) -> None:
-    """Add the arguments of the program."""
-    part.add_argument("file", type=Path)
-    part.add_argument("node")
-    add_options(part, _PART_OPTIONS)
-    part.set_defaults(command=_part)
-
-
-def _part(parsed: argparse.Namespace) -> int:
-    """Start one node of an exported project, and be a peer of the others; returns the exit code."""
-    with signals_noted() as (signals, waker):
-        from neuros.api.execution import Execution
-        from neuros.api.part import part_plan, reach_peers, read_parts
-
-        values = values_of(_PART_OPTIONS, parsed)
-        request = Request(nodes=(parsed.node,), backend="process", network=True, **values)
-        project = read_parts(parsed.file)
-        try:
-            network = reach_peers(request.peers, request.peer_timeout, signals)
-        except EnvironmentFault:
-            if signals:
-                return _CODES_OF_SIGNALS[signals[0]]
-            raise
-        plan = part_plan(project, network, request)
-        return int(Execution(plan, sys.stdout, signals, waker).run()["exit_code"])

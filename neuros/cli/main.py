@@ -53,9 +53,6 @@ COMMANDS = {
     "replay": Subcommand(
         "neuros.cli.replay", "run one node of a recorded run again, or publish recorded topics"
     ),
-    "export": Subcommand(
-        "neuros.cli.launch", "write a project as files for Docker Compose or Kubernetes"
-    ),
     "doctor": Subcommand("neuros.cli.setup", "check this machine, and prove that packets arrive"),
     "containers": Subcommand(
         "neuros.cli.setup", "build, list and remove the images that nodes run in"
@@ -65,9 +62,7 @@ COMMANDS = {
     ),
     "reproduce": Subcommand("neuros.cli.setup", "repeat the published experiments"),
     "node": Subcommand("neuros.cli.node", is_for_people=False),
-    "part": Subcommand("neuros.cli.launch"),
     "import-plugin": Subcommand("neuros.cli.projects", is_for_people=False),
-    "agent": Subcommand("neuros.cli.agent", is_for_people=False),
     "recorder": Subcommand("neuros.cli.recorder", is_for_people=False),
     "replayed": Subcommand("neuros.cli.replay"),
     "dashboard": Subcommand("neuros.cli.views", is_for_people=False),

@@ -270,14 +270,16 @@ def add_doctor(doctor: argparse.ArgumentParser) -> None:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from neuros.doctor.checks import deployment_findings, findings
+    from neuros.doctor.checks import findings
     from neuros.ports import State
+    from neuros.registry import DEPLOYMENTS
 
     found, proves = [], not options.no_delivery
-    looked_at = [findings(os.environ, proves=proves)]
+    looked_at = findings(os.environ, proves=proves)
     if options.deployment is not None:
-        looked_at.append(deployment_findings(options.deployment, proves=proves))
-    for finding in chain.from_iterable(looked_at):
+        machines = DEPLOYMENTS.load("machines")
+        looked_at = chain(looked_at, machines.checks(options.deployment, proves=proves))
+    for finding in looked_at:
         found.append(finding)
         if options.format != JSON:
             print(finding, flush=True)  # the proofs take seconds

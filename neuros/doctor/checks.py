@@ -7,7 +7,6 @@ images, the other answers with what it has read in them.
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import shutil
@@ -22,13 +21,11 @@ from pathlib import Path
 
 from neuros.api.loading import load_with_messages
 from neuros.backends.domain import choose_domain
-from neuros.backends.machines.deployment import Machines
 from neuros.backends.node_command import usable_cores
 from neuros.distribution import install_command, python_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine, answer_of, install_opengl, offscreen_opengl
 from neuros.ports import Finding, SimulatorKind, State
-from neuros.project.deployment import HERE, load_deployment
 from neuros.recording.run_file import read_run_file
 from neuros.registry import BACK_ENDS, SIMULATORS, Part, Registry, option_values
 from neuros.stacks import allow_reading, threads_of
@@ -68,42 +65,6 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
             )
         else:
             yield prove_delivery(back_end.name)
-
-
-def deployment_findings(path: Path, *, proves: bool) -> Iterator[Finding]:
-    """All findings about the machines of a deployment file, one after another.
-
-    Raises:
-        ProjectError: with all problems of the file.
-    """
-    project = load_with_messages(PROJECT)[0].project
-    file = load_deployment(path)
-    inner = BACK_ENDS.load("process").prepare(project, (), {})
-    for host in file.hosts.values():
-        machines = Machines(replace(file, places={"eye": host.name}), project, inner)
-        try:
-            machines.connect(lambda severity, text: None)
-            (side,) = machines.sides
-            yield Finding.good(host.name, side.described())
-            for state, subject, text, remedy in side.machine.examine():
-                yield Finding(State(state), f"{host.name}: {subject}", text, remedy)
-        except EnvironmentFault as fault:
-            yield Finding.bad(host.name, str(fault))
-            continue
-        finally:
-            machines.close()
-        if proves:
-            yield _prove_between(path, host.name)
-
-
-def _prove_between(path: Path, host: str) -> Finding:
-    """Prove delivery between this machine and another one of a deployment file."""
-    hosts = json.loads(path.read_text("utf-8"))["hosts"]
-    used = {name: keys for name, keys in hosts.items() if name in (host, HERE)}
-    with tempfile.TemporaryDirectory(prefix="neuros-doctor-") as folder:
-        alone = Path(folder) / "deployment.json"
-        alone.write_text(json.dumps({"hosts": used, "nodes": {"eye": host}}), "utf-8")
-        return prove_delivery("process", options=("--deployment", str(alone)), where=host)
 
 
 def _parts(registry: Registry[Part]) -> tuple[list[Part], list[Finding]]:

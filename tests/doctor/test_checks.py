@@ -13,7 +13,7 @@ import pytest
 from neuros.backends.docker.back_end import look_at_containers
 from neuros.doctor import checks
 from neuros.ports import Finding, State
-from neuros.registry import BACK_ENDS, SIMULATORS
+from neuros.registry import SIMULATORS
 from neuros.stacks import ProcessThreads
 
 
@@ -93,17 +93,6 @@ def test_a_finding_is_one_line_with_its_remedy() -> None:
     assert str(Finding.bad("ROS 2", "not installed", "run ./install.py")) == (
         "PROBLEM  ROS 2        not installed: run ./install.py"
     )
-
-
-def test_a_back_end_is_tried_with_the_defaults_of_its_options(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    charliecloud = BACK_ENDS.load("charliecloud")
-    monkeypatch.setattr(checks, "_parts", lambda registry: ([charliecloud], []))
-    monkeypatch.setattr("neuros.backends.charliecloud._require_runner", lambda environ: None)
-    *_, delivery = (each for each in checks.findings({}, proves=True) if each.subject == "delivery")
-    assert "charliecloud: not tried" in delivery.text
-    assert "images" in delivery.text
 
 
 # The Docker SDK leaves a socket that could not connect to the garbage collector.

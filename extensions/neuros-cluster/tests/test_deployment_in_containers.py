@@ -16,18 +16,18 @@ from typing import Any
 import pytest
 from docker import DockerClient
 from launching import Running, killed_in_a_hook, launch, start
+from neuros_cluster.remote_engine import AGENT_LABEL
 
 from containers import connected, require_containers, wait_until
-from neuros.backends.docker.remote import AGENT_LABEL
 from neuros.testing.back_ends import PROJECTS
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[3] / "tests/integration"
 STREAM = HERE / "network" / "stream"
 CONNECTION = "source.image -> sink.image"
 ENDLESS = ("--set", "nodes.source.environment.COUNT=0")
 UP_S = 120.0  # on a machine that does many other things
 GONE_S = 6.0
-"""What docs/deployment.md promises."""
+"""What the README promises."""
 SLACK_S = 10.0
 
 

@@ -49,7 +49,7 @@ class Charliecloud(BackEnd):
             default=_FOLDER,
             variable="NEUROS_IMAGE_FOLDER",
             metavar="FOLDER",
-            page="charliecloud.md",
+            page="../extensions/neuros-cluster/README.md#charliecloud",
         ),
     )
 

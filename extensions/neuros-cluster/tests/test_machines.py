@@ -11,16 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
-from neuros.backends.control_sockets import UnixListener, connect
-from neuros.backends.machines.deployment import _texts
-from neuros.backends.machines.files import RECEIVED, RUNS, Follower, TreeStore, scan, write_chunk
-from neuros.backends.machines.machine import ClockOffset, Machine, agent_command
-from neuros.backends.machines.pump import Pump
-from neuros.cli.agent import Agent, remove_old_runs
-from neuros.control import LiveCounters, Message, NodeStatus, Report
-from neuros.control.link import encode
-from neuros.control.machines import (
+from neuros_cluster.agent import Agent, remove_old_runs
+from neuros_cluster.deployment import _texts
+from neuros_cluster.deployment_file import Host
+from neuros_cluster.files import RECEIVED, RUNS, Follower, TreeStore, scan, write_chunk
+from neuros_cluster.machine import ClockOffset, Machine, agent_command
+from neuros_cluster.messages import (
     FROM_AGENT,
     TO_AGENT,
     Chunk,
@@ -28,9 +24,13 @@ from neuros.control.machines import (
     Pong,
     Tree,
 )
+from neuros_cluster.pump import Pump
+
+from neuros.backends.control_sockets import UnixListener, connect
+from neuros.control import LiveCounters, Message, NodeStatus, Report
+from neuros.control.link import encode
 from neuros.errors import EnvironmentFault
 from neuros.ports import ControlStream
-from neuros.project.deployment import Host
 
 _SOON_S = 30.0
 

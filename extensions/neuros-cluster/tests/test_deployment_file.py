@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
+from neuros_cluster.deployment_file import DeploymentFile, Host, load_deployment
 
 from neuros.errors import ProjectError
-from neuros.project.deployment import DeploymentFile, Host, load_deployment
 from neuros.project.model import Node, Project
 
 PROJECT = Project(
@@ -164,3 +165,12 @@ def test_what_is_no_json_is_told_with_its_line(tmp_path: Path) -> None:
 def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
     with pytest.raises(ProjectError, match=r"absent\.json"):
         load_deployment(tmp_path / "absent.json", PROJECT)
+
+
+def test_every_deployment_on_the_page_is_valid(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    shown = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    assert len(shown) == 2
+    for text in shown:
+        (tmp_path / "deployment.json").write_text(text)
+        load_deployment(tmp_path / "deployment.json")

@@ -1,6 +1,6 @@
 """Nodes in containers of an engine on another machine, which needs nothing but that engine.
 
-Each node has a container, and in it an agent (:mod:`neuros.cli.agent`), with which the launcher
+Each node has a container, and in it an agent (:mod:`neuros_cluster.agent`), with which the launcher
 talks over the standard input and output of ``docker start --attach``. An engine behind ``ssh`` is
 reached through a tunnel to its socket. Where it lacks the image of a node, and the engine of this
 machine has it, the image is copied. NeuROS itself and built message packages are put into each
@@ -40,8 +40,8 @@ from neuros.backends.docker.settings import LIBRARY, MESSAGES, NETWORK_MODE, ROO
 from neuros.backends.node_command import DEFAULTS, without_mark
 from neuros.distribution import libraries, python_command
 from neuros.errors import EnvironmentFault
-from neuros.project.deployment import Host
 from neuros.project.model import Node, memory_text
+from neuros_cluster.deployment_file import Host
 
 AGENT_LABEL = "neuros.agent"
 """The label of every container with an agent."""

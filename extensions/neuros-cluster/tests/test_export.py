@@ -16,11 +16,12 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
+from neuros_cluster.command import ExportOptions
+from neuros_cluster.export import export
+from neuros_cluster.part import part_plan, parts_to_json, reach_peers, read_parts
 
-from neuros.api.export import export
-from neuros.api.part import part_plan, parts_to_json, reach_peers, read_parts
 from neuros.api.plan import Network
-from neuros.api.request import ExportOptions, Request
+from neuros.api.request import Request
 from neuros.cli.main import main
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 from neuros.project.load import load_project

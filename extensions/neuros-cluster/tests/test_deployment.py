@@ -17,18 +17,18 @@ from typing import Any
 import pytest
 from ending_bench import Bench, assert_ended
 from launching import Finished, Running, killed_in_a_hook, launch, start
+from neuros_cluster.deployment_file import Host
+from neuros_cluster.files import scan
+from neuros_cluster.machine import Machine, agent_command
+from neuros_cluster.messages import Lacking, ThreadsRead
 
 from containers import wait_until
-from neuros.backends.machines.files import scan
-from neuros.backends.machines.machine import Machine, agent_command
 from neuros.control.link import encode
-from neuros.control.machines import Lacking, ThreadsRead
 from neuros.errors import EnvironmentFault
-from neuros.project.deployment import Host
 from neuros.stacks import ProcessThreads
 from neuros.testing.back_ends import PROJECTS
 
-STREAM = Path(__file__).parent / "network" / "stream"
+STREAM = Path(__file__).parents[3] / "tests/integration/network/stream"
 NEUROS = Path(sys.executable).with_name("neuros")
 CONNECTION = "source.image -> sink.image"
 SLOW_NETWORK = """

@@ -17,9 +17,9 @@ from collections.abc import Callable, Sequence
 
 from neuros.control import Message
 from neuros.control.link import ControlLink, decode, encode, kind_of
-from neuros.control.machines import Closed, Opened, Ping, Pong, Said
 from neuros.errors import ControlError
 from neuros.ports import ControlListener, ControlStream
+from neuros_cluster.messages import Closed, Opened, Ping, Pong, Said
 
 BEAT_S = 1.0
 _CLOSED = "the connection was closed"

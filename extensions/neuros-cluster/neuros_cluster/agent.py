@@ -26,15 +26,20 @@ from typing import TYPE_CHECKING, Any
 
 from neuros.backends.control_sockets import SOCKET_NAME, UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
-from neuros.backends.machines.files import RECEIVED, RUNS, Follower, TreeStore, tree_cache
-from neuros.backends.machines.pump import Pump
 from neuros.backends.process_launchers import ProcessLauncher, RunningProcess, end_now
 from neuros.backends.pythons import Pythons
 from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
 from neuros.backends.sessions import Session, reaper_environment, this_process
 from neuros.control import CONTROL_VARIABLE, Message
-from neuros.control.machines import (
+from neuros.distribution import __version__
+from neuros.errors import EnvironmentFault, NeurosError, ProjectError
+from neuros.ports import NodeProgram
+from neuros.project.split import node_file_text, node_files_from_json
+from neuros.stacks import ProcessThreads
+from neuros.transport.dds_profile import as_asked
+from neuros_cluster.files import RECEIVED, RUNS, Follower, TreeStore, tree_cache
+from neuros_cluster.messages import (
     TO_AGENT,
     Chunk,
     Content,
@@ -59,12 +64,7 @@ from neuros.control.machines import (
     Took,
     Tree,
 )
-from neuros.distribution import __version__
-from neuros.errors import EnvironmentFault, NeurosError, ProjectError
-from neuros.ports import NodeProgram
-from neuros.project.split import node_file_text, node_files_from_json
-from neuros.stacks import ProcessThreads
-from neuros.transport.dds_profile import as_asked
+from neuros_cluster.pump import Pump
 
 if TYPE_CHECKING:
     from neuros.recording.system_load import LoadMonitor

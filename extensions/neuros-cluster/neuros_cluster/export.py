@@ -1,6 +1,6 @@
 """A project as files for Docker Compose or Kubernetes, which then start its nodes.
 
-For Slurm it is a batch script (:func:`neuros.executors.slurm.slurm_script`).
+For Slurm it is a batch script (:func:`neuros_cluster.slurm.slurm_script`).
 
 The folder that is written holds all that a run needs, but for the images that nodes run in::
 
@@ -10,7 +10,7 @@ The folder that is written holds all that a run needs, but for the images that n
     image/             NeuROS, the project, its messages: what is /neuros in a container
     runs/              where Compose has the run folders
 
-What a container starts is in :mod:`neuros.api.part`.
+What a container starts is in :mod:`neuros_cluster.part`.
 """
 
 from __future__ import annotations
@@ -32,15 +32,13 @@ from typing import Any
 
 import yaml
 
-from neuros.api.part import parts_to_json
 from neuros.api.plan import named_peers, time_problems
-from neuros.api.request import ExportOptions, check_names, parse_duration
+from neuros.api.request import parse_duration
 from neuros.backends.containers import bare_name, files_of, find_recipe
 from neuros.backends.domain import valid_domain
 from neuros.backends.node_command import THREAD_VARIABLES
 from neuros.distribution import WORKSPACE, libraries, python_command
 from neuros.errors import ProjectError, UsageError
-from neuros.executors.slurm import slurm_script
 from neuros.options import options_of
 from neuros.ports import JobResources
 from neuros.project.load import PROJECT_FILE
@@ -48,6 +46,9 @@ from neuros.project.model import Folders, Node, NodeFile, Project, memory_text
 from neuros.project.paths import NOT_COPIED, files_to_copy
 from neuros.project.split import split, translated
 from neuros.project.suggest import did_you_mean
+from neuros_cluster.command import ExportOptions, check_names
+from neuros_cluster.part import parts_to_json
+from neuros_cluster.slurm import slurm_script
 
 ROOT = Path("/neuros")
 FOLDERS = Folders(project=ROOT / "project", workspace=ROOT / "lib/workspace", run=ROOT / "runs")
@@ -492,8 +493,8 @@ FORMS: Mapping[str, Form] = {
     "kubernetes": Form(
         "kubernetes.yaml",
         _kubernetes,
-        "# Build and push the images of the Dockerfile (docs/export.md), then: kubectl apply -f"
-        " kubernetes.yaml\n",
+        "# Build and push the images of the Dockerfile (extensions/neuros-cluster/README.md), then:"
+        " kubectl apply -f kubernetes.yaml\n",
         ("devices", "display"),
     ),
 }

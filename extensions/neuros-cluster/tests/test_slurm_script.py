@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from neuros_cluster.deployment_file import DeploymentFile, load_deployment
+from neuros_cluster.slurm import slurm_script
 from slurm import slurm_cluster
 
 from neuros.cli.main import main
-from neuros.executors.slurm import slurm_script
-from neuros.project.deployment import DeploymentFile, load_deployment
 
-STREAM = Path(__file__).parent / "network" / "stream"
+STREAM = Path(__file__).parents[3] / "tests/integration/network/stream"
 WHERE = """
 import os
 from neuros.hooks import neuros_initialise

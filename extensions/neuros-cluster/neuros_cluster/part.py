@@ -7,7 +7,9 @@ exported, so that a part needs its ``node.json`` files only, which lie in one fi
 
 from __future__ import annotations
 
+import argparse
 import json
+import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,13 +18,18 @@ from typing import Any
 from neuros.api.plan import Network, Plan, check_machine, chosen_network
 from neuros.api.request import Request
 from neuros.backends.process_launchers import PROCESS
+from neuros.cli.launch import signals_noted
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.options import add_options, options_of, values_of
 from neuros.project.model import Budgets, NodeFile, Project
 from neuros.project.names import Names
 from neuros.project.split import budgets_to_json, node_file_to_json, node_files_from_json
 from neuros.registry import Chosen
 
 _AGAIN_S = 0.5
+_OF_PARTS = ("domain_id", "peers", "peer_timeout", "duration", "output", "verbose")
+_PART_OPTIONS = [each for each in options_of(Request) if each.name in _OF_PARTS]
+_CODES_OF_SIGNALS = {2: 130, 15: 143, 1: 143}
 
 
 def parts_to_json(project: Project, files: Sequence[NodeFile]) -> dict[str, Any]:
@@ -108,3 +115,29 @@ def reach_peers(peers: str | None, timeout_s: float | None, signals: Sequence[in
             if signals or time.monotonic() >= deadline_s:
                 raise
         time.sleep(_AGAIN_S)
+
+
+def add_part(part: argparse.ArgumentParser) -> None:
+    """Add the arguments of the program."""
+    part.add_argument("file", type=Path)
+    part.add_argument("node")
+    add_options(part, _PART_OPTIONS)
+    part.set_defaults(command=_part)
+
+
+def _part(parsed: argparse.Namespace) -> int:
+    """Start one node of an exported project, and be a peer of the others; returns the exit code."""
+    with signals_noted() as (signals, waker):
+        from neuros.api.execution import Execution
+
+        values = values_of(_PART_OPTIONS, parsed)
+        request = Request(nodes=(parsed.node,), backend="process", network=True, **values)
+        project = read_parts(parsed.file)
+        try:
+            network = reach_peers(request.peers, request.peer_timeout, signals)
+        except EnvironmentFault:
+            if signals:
+                return _CODES_OF_SIGNALS[signals[0]]
+            raise
+        plan = part_plan(project, network, request)
+        return int(Execution(plan, sys.stdout, signals, waker).run()["exit_code"])

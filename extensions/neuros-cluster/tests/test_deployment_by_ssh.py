@@ -33,8 +33,7 @@ from neuros.backends.sessions import Session, sessions
 from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, Watch
 from neuros.control.link import ControlLink
 
-HERE = Path(__file__).parent
-STREAM = HERE / "stream"
+STREAM = Path(__file__).parents[3] / "tests/integration/network/stream"
 WHISKEYE = EXAMPLES / "4_neurorobotics/whiskeye"
 NEUROS = Path(sys.executable).with_name("neuros")
 CONNECTION = "source.image -> sink.image"
@@ -43,7 +42,7 @@ UP_S = 60.0  # on a machine that does many other things
 PATIENCE_S = 600.0
 TIMEOUT_S = 5.0
 GONE_S = 6.0
-"""What docs/deployment.md promises, beside the time-out."""
+"""What the README promises, beside the time-out."""
 SLACK_S = 20.0
 
 

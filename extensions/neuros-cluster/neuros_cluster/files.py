@@ -33,9 +33,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
-from neuros.control.machines import Chunk, Tree, TreeFile
 from neuros.errors import EnvironmentFault
 from neuros.ordinary_files import folder_in, open_itself, open_log
+from neuros_cluster.messages import Chunk, Tree, TreeFile
 
 RECEIVED, RUNS = "received", "runs"
 """Folders of agents beside the trees, whose names end with a key."""

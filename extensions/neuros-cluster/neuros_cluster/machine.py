@@ -19,9 +19,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
-import neuros.control.machines as agent
-from neuros.backends.machines.files import scan, write_chunk
-from neuros.backends.machines.pump import Pump
+import neuros_cluster.messages as agent
 from neuros.backends.node_command import without_mark
 from neuros.control import FROM_NODES, Message, NodeStatus, Probed, Report
 from neuros.control.link import decode, encode, kind_of
@@ -29,9 +27,11 @@ from neuros.distribution import WORKSPACE, __version__
 from neuros.errors import ControlError, EnvironmentFault
 from neuros.ordinary_files import folder_in, open_itself, reason_of, write_whole
 from neuros.ports import ControlStream
-from neuros.project.deployment import Host
 from neuros.project.model import Folders
 from neuros.stacks import ProcessThreads
+from neuros_cluster.deployment_file import Host
+from neuros_cluster.files import scan, write_chunk
+from neuros_cluster.pump import Pump
 
 _SSH = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
 _CONNECT_S = 60.0

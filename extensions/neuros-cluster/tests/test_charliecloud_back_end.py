@@ -8,13 +8,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from neuros_cluster.charliecloud import BACK_END
 
-from neuros.backends.charliecloud import BACK_END
 from neuros.cli.main import main
 from neuros.distribution import PACKAGE
+from neuros.doctor import checks
 from neuros.ports import State
 
-CLOCK = Path(__file__).parents[2] / "examples/1_tick/clock"
+CLOCK = Path(__file__).parents[3] / "examples/1_tick/clock"
 RUNNER = """#!/bin/sh
 [ -z "$USER" ] && echo 'error: $USER not set' >&2 && exit 1
 [ -e "$1/forbidden" ] && echo "error: can't init user+mount namespaces" >&2 && exit 1
@@ -93,3 +94,13 @@ def test_the_doctor_says_which_images_there_are(folder: Path) -> None:
     (found,) = BACK_END.checks({**environ, "PATH": "/none"})
     assert found.state is State.ABSENT
     assert "Charliecloud is not installed" in found.text
+
+
+def test_a_back_end_is_tried_with_the_defaults_of_its_options(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(checks, "_parts", lambda registry: ([BACK_END], []))
+    monkeypatch.setattr("neuros_cluster.charliecloud._require_runner", lambda environ: None)
+    *_, delivery = (each for each in checks.findings({}, proves=True) if each.subject == "delivery")
+    assert "charliecloud: not tried" in delivery.text
+    assert "images" in delivery.text

@@ -8,35 +8,45 @@ run folder.
 from __future__ import annotations
 
 import contextlib
+import json
 import re
 import socket
-from collections.abc import Callable, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.control_sockets import connect
-from neuros.backends.machines.machine import Log, Machine, agent_command, ssh_command
 from neuros.backends.node_command import moved
 from neuros.control import CONTROL_VARIABLE
-from neuros.control.machines import Finished, Ready, Start
 from neuros.distribution import WORKSPACE
 from neuros.errors import EnvironmentFault, results_of
 from neuros.ordinary_files import open_itself
-from neuros.ports import Deployment, Launcher, NodeProgram, RunningNode
-from neuros.project.deployment import DeploymentFile, Host
-from neuros.project.model import Folders, NodeFile, Project
+from neuros.ports import (
+    Deployment,
+    DeploymentKind,
+    Finding,
+    Launcher,
+    NodeProgram,
+    RunningNode,
+    State,
+)
+from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.project.split import node_file_to_json, split, translated
+from neuros.registry import BACK_ENDS
 from neuros.stacks import ProcessThreads
+from neuros_cluster.deployment_file import HERE, DeploymentFile, Host, load_deployment
+from neuros_cluster.machine import Log, Machine, agent_command, ssh_command
+from neuros_cluster.messages import Finished, Ready, Start
 
 if TYPE_CHECKING:
-    from neuros.backends.docker.remote import AgentContainer, RemoteEngine
+    from neuros_cluster.remote_engine import AgentContainer, RemoteEngine
 
 _PEERS = "ROS_STATIC_PEERS"
 _ANY_PORT = 9
-_MUCH_S = 0.1
-"""Clocks that are further apart than this are worth a warning."""
+_MUCH_S = 0.1  # clocks that are further apart are worth a warning
 
 
 @dataclass
@@ -98,27 +108,11 @@ class Machines(Deployment):
         self._held: list[Machine | AgentContainer | RemoteEngine] = []
         self.project = project
         self.notices = inner.notices
+        self.places = file.places
         self._inner = inner
 
-    @property
-    def places(self) -> Mapping[str, str]:
-        """The machine of each node that is not here."""
-        return self.file.places
-
-    @property
-    def peers(self) -> tuple[str, ...]:
-        """The addresses of the other machines."""
-        return tuple(dict.fromkeys(side.address for side in self.sides))
-
-    def connect(self, log: Log) -> None:
-        """Reach all machines and get them ready, side by side.
-
-        Args:
-            log: takes lines for the user, in any thread.
-
-        Raises:
-            EnvironmentFault: with all that went wrong; none of them is held any more then.
-        """
+    def connect(self, log: Log) -> Sequence[str]:
+        """Reach all machines and get them ready, side by side; returns their addresses."""
         hosts = self.file.used
         with ThreadPoolExecutor(max(1, len(hosts)), "neuros-machines") as threads:
             work = [threads.submit(self._sides_of, host, log) for host in hosts]
@@ -142,6 +136,7 @@ class Machines(Deployment):
                     f" {'ahead of' if ahead_s > 0 else 'behind'} that of this machine, and so are"
                     " the times in its logs and recordings: set it (chrony, systemd-timesyncd)",
                 )
+        return [*dict.fromkeys(side.address for side in self.sides)]
 
     def close(self) -> None:
         """Hang up on all machines, whose agents then end what is left."""
@@ -204,7 +199,7 @@ class Machines(Deployment):
         if not host.docker:
             return [self._side(host, names, log)]
         # The Docker SDK is slow to import.
-        from neuros.backends.docker.remote import RemoteEngine
+        from neuros_cluster.remote_engine import RemoteEngine
 
         engine = RemoteEngine(host, ssh_command(host))
         self._held.append(engine)
@@ -420,3 +415,57 @@ def _own_address(here: Host, address: str) -> str:
                 f"this machine cannot reach {address} ({error.strerror}), the address of its nodes"
             ) from error
         return str(probe.getsockname()[0])
+
+
+class _Machines(DeploymentKind):
+    name = "machines"
+
+    def prepare(
+        self,
+        file: Path,
+        project: Project,
+        here: Callable[[Sequence[Node]], Deployment],
+        *,
+        monitors_load: bool,
+    ) -> Deployment:
+        found = load_deployment(file, project)
+        inner = here([node for node in project.nodes if node.name not in found.places])
+        return Machines(found, project, inner, monitors_load=monitors_load)
+
+    def checks(self, file: Path, *, proves: bool) -> Iterator[Finding]:
+        from neuros.api.loading import load_with_messages
+        from neuros.doctor.checks import PROJECT
+
+        project = load_with_messages(PROJECT)[0].project
+        found = load_deployment(file)
+        inner = BACK_ENDS.load("process").prepare(project, (), {})
+        for host in found.hosts.values():
+            machines = Machines(replace(found, places={"eye": host.name}), project, inner)
+            try:
+                machines.connect(lambda severity, text: None)
+                (side,) = machines.sides
+                yield Finding.good(host.name, side.described())
+                for state, subject, text, remedy in side.machine.examine():
+                    yield Finding(State(state), f"{host.name}: {subject}", text, remedy)
+            except EnvironmentFault as fault:
+                yield Finding.bad(host.name, str(fault))
+                continue
+            finally:
+                machines.close()
+            if proves:
+                yield _prove_between(file, host.name)
+
+
+def _prove_between(path: Path, host: str) -> Finding:
+    """Prove delivery between this machine and another one of a deployment file."""
+    from neuros.doctor.checks import prove_delivery
+
+    hosts = json.loads(path.read_text("utf-8"))["hosts"]
+    used = {name: keys for name, keys in hosts.items() if name in (host, HERE)}
+    with tempfile.TemporaryDirectory(prefix="neuros-doctor-") as folder:
+        alone = Path(folder) / "deployment.json"
+        alone.write_text(json.dumps({"hosts": used, "nodes": {"eye": host}}), "utf-8")
+        return prove_delivery("process", options=("--deployment", str(alone)), where=host)
+
+
+MACHINES = _Machines()

@@ -107,7 +107,7 @@ def test_on_slurm_a_sweep_is_one_array_with_the_resources_of_the_project(tmp_pat
 def test_a_job_that_is_killed_is_a_row_and_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuros.executors.slurm._ASK_S", 1.0)
+    monkeypatch.setattr("neuros_cluster.slurm._ASK_S", 1.0)
     project = dice(tmp_path, ENDLESS)
     table = tmp_path / "table"
     arguments: dict[str, Any] = {"backend": "in-process", "executor": "slurm", "output": table}
@@ -192,7 +192,7 @@ def test_on_dask_workers_take_what_their_resources_allow(dask: str, tmp_path: Pa
 def test_a_dask_scheduler_that_is_not_there_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuros.executors.executor._ANSWER_S", 0.5)
+    monkeypatch.setattr("neuros_cluster.dask._ANSWER_S", 0.5)
     with pytest.raises(EnvironmentFault, match="no Dask scheduler answers at tcp:"):
         neuros.sweep(dice(tmp_path), executor="dask=tcp://127.0.0.1:9", output=tmp_path / "table")
 

@@ -23,9 +23,9 @@ from types import FrameType
 from typing import Any
 
 from neuros.errors import EnvironmentFault
-from neuros.executors.executor import not_installed
 from neuros.installation.machine import answer_of
 from neuros.ports import Job, JobResources, Jobs, SweepExecutor, SweepPlan
+from neuros_cluster.dask import not_installed
 
 FOLDER = ".slurm"
 """Logs, jobs and results, in the folder of the sweep."""

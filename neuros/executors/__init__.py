@@ -1,1 +1,0 @@
-"""Executors of sweeps: where the runs of a sweep are executed, each registered by its name."""
