@@ -73,10 +73,6 @@ class Transport(Protocol):
         """Digests of all packets sent or received on connections that keep them; read once."""
 
     @property
-    def foreign(self) -> Mapping[str, int]:
-        """By connection, messages on its topics from others than its two nodes."""
-
-    @property
     def compressed(self) -> Mapping[str, tuple[int, int]]:
         """By connection on which this node compresses: bytes before and after."""
 

@@ -17,7 +17,6 @@ import hashlib
 import json
 import os
 import platform
-import secrets
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -106,7 +105,7 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
     Raises:
         UsageError: if the folder cannot be written to, or another run has just begun there.
     """
-    files = _with_keys(plan.node_files(folders_of(plan, run_folder)))
+    files = plan.node_files(folders_of(plan, run_folder))
     try:
         # Two runs that were given the same empty folder: only one of them gets it.
         with open(run_folder / "project.json", "x", encoding="utf-8") as expanded:
@@ -115,7 +114,7 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
             (run_folder / file.node.name).mkdir(exist_ok=True)
             path = run_folder / file.node.name / "node.json"
             seen = plan.deployment.as_seen(file)
-            path.touch(0o600)  # wherever the folder is: it holds keys
+            path.touch(0o600)  # wherever the folder is: it holds the environment
             path.write_text(node_file_text(seen), "utf-8")
     except FileExistsError as error:
         raise UsageError(
@@ -126,22 +125,6 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
             f"{run_folder} cannot be written to ({error.strerror}): name another folder with -o"
         ) from error
     return files
-
-
-def _with_keys(files: Sequence[NodeFile]) -> list[NodeFile]:
-    """The files with a key for each connection between two of their nodes."""
-    here = {file.node.name for file in files}
-    within = {
-        c.index
-        for file in files
-        for c in file.connections
-        if {c.source_node, c.destination_node} <= here
-    }
-    keys = {index: secrets.token_hex(16) for index in within}
-    return [
-        replace(f, keys={c.index: keys[c.index] for c in f.connections if c.index in keys})
-        for f in files
-    ]
 
 
 # ---------------------------------------------------------------------- recording

@@ -71,9 +71,8 @@ def run_table(record: Mapping[str, Any]) -> str:
     from tabulate import tabulate
 
     counts: tuple[str, ...] = _COUNTS
-    for count in ("in_flight", "foreign"):
-        if any(c.get(count) for c in record["connections"]):
-            counts = (*counts, count)
+    if any(c.get("in_flight") for c in record["connections"]):
+        counts = (*counts, "in_flight")
     connections = [[c["connection"], *(c[key] for key in counts)] for c in record["connections"]]
     header = ("connection", *(count.replace("_", " ") for count in counts))
     nodes = [[name, *_shares(node, record["running_s"])] for name, node in record["nodes"].items()]
@@ -145,7 +144,6 @@ def _connection(
         "in_flight": in_flight,
         "lost": lost,
         **{field: incoming.get(field) for field in fields},
-        "foreign": sum(report.foreign.get(key, 0) for report in reports.values()),
     }
     packets = read_packets(run_folder, connection)
     figures |= packet_figures(packets, may_lose=may_have_lost(figures))

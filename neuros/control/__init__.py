@@ -140,7 +140,6 @@ class Report(Message):
         metrics: ``None`` before the node has begun.
         stack: where the plugin stands, if its hook runs for long.
         fault: what cannot be recorded.
-        foreign: by connection, messages from others than its two nodes.
         compressed: by connection on which the node compresses, bytes before and after.
         is_driving: whether some hook starts with no packet for it.
         is_final: whether this is the last report.
@@ -155,7 +154,6 @@ class Report(Message):
     metrics: Metrics | None = None
     stack: Stack | None = None
     fault: str | None = None
-    foreign: Mapping[str, int] = field(default_factory=dict)
     compressed: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     is_driving: bool = False
     is_final: bool = False

@@ -93,7 +93,6 @@ class NodeReports:
             "metrics": metrics,
             "stack": self._stack(metrics),
             "fault": self._fault,
-            "foreign": {name: n for name, n in self._transport.foreign.items() if n},
             "compressed": self._transport.compressed,
             "is_driving": engine is not None and engine.is_driving,
         }

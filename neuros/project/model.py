@@ -258,8 +258,6 @@ class NodeFile:
         messages: where Python finds the message packages of workspaces, a folder for each: it is
             called ``python``, and lies in that of the built package.
         names: the project's.
-        keys: by index of a connection, a secret of its two nodes, hexadecimal. None where one of
-            them is another launcher's.
         list_bytes: so much each list of its packet log has at most; 0: it keeps none.
     """
 
@@ -269,7 +267,6 @@ class NodeFile:
     index: int = 0
     messages: tuple[Path, ...] = ()
     names: Names = _NO_NAMES
-    keys: Mapping[int, str] = field(default_factory=dict, hash=False, repr=False)
     list_bytes: int = 64_000_000
 
 

@@ -61,7 +61,6 @@ def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
         "messages": [str(path) for path in node_file.messages],
         "index": node_file.index,
         "list_bytes": node_file.list_bytes,
-        "keys": {str(index): key for index, key in node_file.keys.items()},
         "file": str(node.file),
         "pointer": node.pointer,
         "environment_paths": list(node.environment_paths),
@@ -106,7 +105,6 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
         index=content["index"],
         messages=tuple(map(Path, content.get("messages", ()))),
         names=names,
-        keys={int(index): key for index, key in content.get("keys", {}).items()},
         **({"list_bytes": content["list_bytes"]} if "list_bytes" in content else {}),
     )
 

@@ -146,8 +146,7 @@ def _file(name: str, connections: Sequence[Connection]) -> NodeFile:
         ),
     )
     own = tuple(c for c in connections if name in (c.source_node, c.destination_node))
-    keys = {c.index: f"{c.index:032x}" for c in own}
-    return NodeFile(node, own, Folders(Path(), Path(), Path()), keys=keys)
+    return NodeFile(node, own, Folders(Path(), Path(), Path()))
 
 
 class TransportChecks:

@@ -104,7 +104,6 @@ class MemoryTransport:
         self._given = Given()
         self.watched = self._given.watched
         self._digest = digest
-        self.foreign: dict[str, int] = {}  # nobody else can put anything in
         self.compressed: dict[str, tuple[int, int]] = {}  # nothing leaves the machine
         self.digests: dict[Connection, array[int]] = {}
         for c in file.connections:

@@ -70,7 +70,6 @@ class _NullTransport:
     """A transport that carries nothing (:class:`neuros.ports.Transport`)."""
 
     digests: Mapping[Connection, array[int]] = {}
-    foreign: Mapping[str, int] = {}
     compressed: Mapping[str, tuple[int, int]] = {}
 
     def open(self, inbox: Inbox) -> None: ...

@@ -1,13 +1,14 @@
 """The ROS 2 transport: packets of a node over topics, and the registration of its connections.
 
 A connection has three topics below ``/neuros/<source>/<output>/<destination>/<input>``: ``/data``,
-``/ack`` (the position of the last packet that every taker has started on), and ``/reg``. Only what
-its own two nodes publish there is taken: see :mod:`neuros.transport.envelope`.
+``/ack`` (the position of the last packet that every taker has started on), and ``/reg``. Who else
+publishes there is named in the log (:class:`neuros.transport.ros_graph.StrangerCheck`).
 """
 
 from __future__ import annotations
 
 import functools
+import struct
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,32 +24,24 @@ from rclpy.qos import (
     QoSReliabilityPolicy,
 )
 from rclpy.subscription import Subscription
-from rclpy.timer import Timer
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-from std_msgs.msg import String, UInt64MultiArray
+from std_msgs.msg import String, UInt64
 
 from neuros.ports import HookFunction, Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.codecs import Codec, Decoder, Encoder, message_codec
 from neuros.transport.digests import Digest, digest_for, digest_of_data, make_digests
-from neuros.transport.envelope import (
-    Compressor,
-    DataTags,
-    Positions,
-    Traffic,
-    compressing,
-    decompressing,
-    signed,
-    verified,
-)
+from neuros.transport.envelope import Compressor, Traffic, compressing, decompressing
 from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel, machine_token
 from neuros.transport.messages import message_class
-from neuros.transport.ros_graph import ExternalTopics, data_qos, is_compatible
+from neuros.transport.ros_graph import ExternalTopics, StrangerCheck, data_qos, is_compatible
 from neuros.transport.ros_loop import RosLoop
 
 _ANNOUNCE_S = 0.02
-_NAME_S = 0.5
-"""The ROS graph lists an endpoint a moment before it knows its node."""
+
+_HEADER = b"\0\1\0\0"
+_POSITION = struct.Struct("<4sQ")
+"""A ``std_msgs/msg/UInt64`` in little-endian CDR: the header, and the position."""
 
 
 @dataclass
@@ -56,7 +49,7 @@ class SendingLink:
     """One connection at its sender.
 
     Attributes:
-        publish: publishes what the codec makes, with the tag of the packet.
+        publish: publishes what the codec makes.
         count_readers: returns the number of all subscriptions to the data topic.
         digests: of the packets sent.
         carries_message: whether the codec makes the packet as ROS serialises it.
@@ -116,9 +109,13 @@ def _way(connection: Connection, port: Port, traffic: Traffic) -> tuple[type, Co
     return kind, message_codec(kind), digest_for(kind)
 
 
-def _tagging(tags: DataTags, publish: Callable[[bytes], None]) -> Callable[[bytes], None]:
-    add = tags.add
-    return lambda data: publish(add(data))
+def position_of(data: bytes) -> int:
+    """The position in an acknowledgement. Raises ``WrongBytes``."""
+    if len(data) == _POSITION.size and data[:4] == _HEADER:
+        position: int = _POSITION.unpack(data)[1]
+    else:  # the byte order of another machine
+        position = message_codec(UInt64).decode(data).data
+    return position
 
 
 def _nowhere(position: int) -> None:
@@ -137,7 +134,7 @@ _HEARD = QoSProfile(
     reliability=QoSReliabilityPolicy.RELIABLE,
     durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""QoS of the readers of ``/reg`` and ``/ack``: foreign messages there push out no other."""
+"""QoS of the readers of ``/reg`` and ``/ack``: messages of others there push out none."""
 
 _READY = "ready"
 _CONFIRMED = "confirmed"
@@ -149,18 +146,15 @@ class RosTransport:
     def __init__(self, file: NodeFile, ros_node: RosNode, loop: RosLoop) -> None:
         self._node = file.node
         self._connections = file.connections
-        self._keys = file.keys
         self._ros_node = ros_node
         self._loop = loop
         self._sending: dict[Connection, SendingLink] = {}
         self._receiving: dict[Connection, ReceivingLink] = {}
         self._external = ExternalTopics(file, ros_node, loop)
         self.digests = make_digests(file.connections)
-        self.foreign = {str(connection): 0 for connection in file.connections}
         self._traffic: dict[str, Traffic] = {}
         self._compressors: dict[str, Compressor] = {}
-        self._unnamed: list[tuple[Connection, str]] = []
-        self._naming: Timer | None = None
+        self._strangers = StrangerCheck(ros_node, loop)
         self._registrations: list[Registration] = []
         self._large = LargeCodecs(file, ros_node.get_logger().warning)
         self._is_open = False
@@ -242,7 +236,7 @@ class RosTransport:
     def close(self) -> None:
         """Publish and receive nothing any more; the endpoints go with their ROS node."""
         self._is_open = False
-        self._name_foreign()
+        self._strangers.close()
         self._external.close()
         self._large.close()
 
@@ -256,10 +250,8 @@ class RosTransport:
         data = self._ros_node.create_publisher(
             kind, f"{connection.topic}/data", data_qos(connection)
         )
-        key = self._keys.get(connection.index)
-        publish = data.handle.publish_raw
         self._sending[connection] = SendingLink(
-            publish if key is None else _tagging(DataTags(key), publish),
+            data.handle.publish_raw,
             codec,
             digest,
             data.get_subscription_count,
@@ -268,17 +260,12 @@ class RosTransport:
         )
         subscriptions = []
         if connection.is_reliable:
-            decode = Positions(key).decode
 
-            def take_position(data: bytes) -> None:
-                position = decode(data)
-                if position is None:
-                    self._refuse(connection, "ack")
-                else:
-                    inbox.on_acknowledgement(connection, position)
+            def receive_position(data: bytes) -> None:
+                inbox.on_acknowledgement(connection, position_of(data))
 
             subscriptions.append(
-                self._subscribe(UInt64MultiArray, f"{connection.topic}/ack", _HEARD, take_position)
+                self._subscribe(UInt64, connection, "ack", _HEARD, receive_position)
             )
         self._registrations.append(
             Registration(
@@ -287,8 +274,7 @@ class RosTransport:
                 publishers=[data],
                 subscriptions=subscriptions,
                 is_sender=True,
-                key=key,
-                on_foreign=lambda: self._refuse(connection, "reg"),
+                strangers=self._strangers,
                 on_registered=lambda note: self._loop.post(
                     partial(self._meet_receiver, connection, note, inbox)
                 ),
@@ -304,22 +290,17 @@ class RosTransport:
             partial(inbox.on_packet, connection),
             self.digests[connection],
         )
-        key = self._keys.get(connection.index)
         publishers = []
         if connection.is_reliable:
             acknowledge = self._ros_node.create_publisher(
-                UInt64MultiArray, f"{connection.topic}/ack", _LATCHED
+                UInt64, f"{connection.topic}/ack", _LATCHED
             )
-            encode, publish = Positions(key).encode, acknowledge.handle.publish_raw
-            link.publish_position = lambda position: publish(encode(position))
+            publish = acknowledge.handle.publish_raw
+            link.publish_position = lambda position: publish(_POSITION.pack(_HEADER, position))
             publishers.append(acknowledge)
-        receive: Callable[..., None] = link.receive
-        if connection.is_zstd:
-            receive = decompressing(receive)
-        if key is not None:
-            receive = self._checking(connection, DataTags(key), receive)
+        receive = decompressing(link.receive) if connection.is_zstd else link.receive
         data = self._subscribe(
-            kind, f"{connection.topic}/data", data_qos(connection, is_reader=True), receive
+            kind, connection, "data", data_qos(connection, is_reader=True), receive
         )
         self._registrations.append(
             Registration(
@@ -328,8 +309,7 @@ class RosTransport:
                 publishers=publishers,
                 subscriptions=[data],
                 is_sender=False,
-                key=key,
-                on_foreign=lambda: self._refuse(connection, "reg"),
+                strangers=self._strangers,
                 note=self._large.note(connection),
                 on_registered=lambda _: None,
             )
@@ -354,62 +334,28 @@ class RosTransport:
     def _subscribe(
         self,
         kind: type,
-        topic: str,
+        connection: Connection,
+        part: str,
         qos: QoSProfile,
-        deliver: Callable[..., None],
+        deliver: Callable[[bytes], None],
     ) -> Subscription:
         """Subscribe to serialised messages until the transport closes."""
+        topic = f"{connection.topic}/{part}"
+        writer = connection.source_node if part == "data" else connection.destination_node
 
         @functools.wraps(deliver)  # rclpy asks for its signature
-        def receive(*message: Any) -> None:
+        def receive(data: bytes) -> None:
             if self._is_open:
-                # The events executor hands over a message and its info as one tuple.
-                deliver(*(message[0] if type(message[0]) is tuple else message))
+                deliver(data)
 
         return self._ros_node.create_subscription(
-            kind, topic, self._loop.guarded(receive), qos, raw=True
+            kind,
+            topic,
+            self._loop.guarded(receive),
+            qos,
+            event_callbacks=self._strangers.callbacks(connection, topic, writer),
+            raw=True,
         )
-
-    def _checking(
-        self, connection: Connection, tags: DataTags, take: Callable[[bytes], None]
-    ) -> Callable[[bytes, Mapping[str, int]], None]:
-        """``take`` for the packets of the registered writer alone."""
-        remove = tags.remove
-
-        def receive(data: bytes, info: Mapping[str, int]) -> None:
-            packet = remove(data, info["publication_sequence_number"])
-            if packet is None:
-                self._refuse(connection, "data")
-            else:
-                take(packet)
-
-        return receive
-
-    def _refuse(self, connection: Connection, part: str) -> None:
-        """Count a message that is not from the other end; the first one is named in the log."""
-        self.foreign[str(connection)] += 1
-        if self.foreign[str(connection)] == 1:
-            self._unnamed.append((connection, part))
-            if self._naming is None:
-                self._naming = self._loop.every(self._ros_node, _NAME_S, self._name_foreign)
-
-    def _name_foreign(self) -> None:
-        """Say on which topics foreign messages have come, and who publishes there."""
-        if self._naming is not None:
-            self._ros_node.destroy_timer(self._naming)
-            self._naming = None
-        for connection, part in self._unnamed:
-            topic = f"{connection.topic}/{part}"
-            listed = self._ros_node.get_publishers_info_by_topic(topic)
-            names = {each.node_name for each in listed}
-            others = sorted(names - {connection.source_node, connection.destination_node})
-            seen = ", ".join(others) or "none that can be seen"
-            self._ros_node.get_logger().warning(
-                f"{connection}: a message on {topic} is not from its node: it is dropped, and"
-                f" counted as foreign; others that publish there: {seen}. --isolate keeps others"
-                " out"
-            )
-        self._unnamed.clear()
 
     def _look_for_others(self) -> None:
         pending = [each for each in self._registrations if not each.advance()]
@@ -432,9 +378,8 @@ class Registration:
     compatible endpoints that the graph lists are matched.
 
     Args:
-        key: of the connection; ``None``: the other end is another launcher's, and has none.
+        strangers: names others that publish on ``/reg``.
         note: what a receiver lets its sender know of itself, one line.
-        on_foreign: called for each message that is not from the other end.
         on_registered: called once, in the loop's thread, when this end is sure of the other;
             a sender gets the receiver's note, a receiver an empty one.
     """
@@ -447,9 +392,8 @@ class Registration:
         publishers: list[Publisher],
         subscriptions: list[Subscription],
         is_sender: bool,
-        key: str | None,
+        strangers: StrangerCheck,
         note: str = "",
-        on_foreign: Callable[[], None],
         on_registered: Callable[[str], None],
     ) -> None:
         self.connection = connection
@@ -459,15 +403,20 @@ class Registration:
         self._subscriptions = subscriptions
         self._is_sender = is_sender
         self._peer = connection.destination_node if is_sender else connection.source_node
-        self._key = key
-        self._on_foreign = on_foreign
         self._on_registered = on_registered
         self._announcement = f"{_READY} {note}"
         self._peer_is_ready = False
         self._peer_note = ""
         topic = f"{connection.topic}/reg"
         self._reg_publisher = ros_node.create_publisher(String, topic, _LATCHED)
-        self._reg_subscription = ros_node.create_subscription(String, topic, self._receive, _HEARD)
+        nodes = (connection.source_node, connection.destination_node)
+        self._reg_subscription = ros_node.create_subscription(
+            String,
+            topic,
+            self._receive,
+            _HEARD,
+            event_callbacks=strangers.callbacks(connection, topic, *nodes),
+        )
 
     def advance(self) -> bool:
         """Look again, announce or confirm where it is time; returns whether all is done."""
@@ -481,15 +430,10 @@ class Registration:
         return self.is_done
 
     def _publish(self, text: str) -> None:
-        said = text if self._key is None else signed(text, self._key)
-        self._reg_publisher.publish(String(data=said))
+        self._reg_publisher.publish(String(data=text))
 
     def _receive(self, message: String) -> None:
-        text = message.data if self._key is None else verified(message.data, self._key)
-        if text is None:
-            self._on_foreign()
-            return
-        state, _, note = text.partition(" ")
+        state, _, note = message.data.partition(" ")
         if self._is_sender and state == _READY:
             self._peer_is_ready = True
             self._peer_note = note

@@ -2,13 +2,15 @@
 
 External topics are plain ROS topics, with the QoS that the project asks for. A registration proves
 each connection between nodes. An external topic has no other end that could confirm, so ROS graph
-checks look for two mistakes that nothing else would tell: QoS that does not fit, and silence. The
+checks look for two mistakes that nothing else would tell: QoS that does not fit, and silence. A
+third check names strangers that publish on the topics of connections. The
 bridge gives nodes of one process their place in the ROS graph.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -198,7 +200,7 @@ def qos_profile(qos: Qos) -> QoSProfile:
 def data_qos(connection: Connection, *, is_reader: bool = False) -> QoSProfile:
     """Deep enough for DDS itself to drop nothing that flow control lets through.
 
-    A reader has one history for all writers: it keeps all, so that foreign packets drop none.
+    A reader has one history for all writers: it keeps all, so that packets of others drop none.
     """
     if not connection.is_reliable:
         return QoSProfile(depth=connection.window, reliability=QoSReliabilityPolicy.BEST_EFFORT)
@@ -307,6 +309,60 @@ def qos_differences(offered: QoSProfile, asked: QoSProfile) -> Iterator[tuple[st
 def is_compatible(offered: QoSProfile, asked: QoSProfile) -> bool:
     """Whether DDS connects a publisher and a subscription."""
     return not any(qos_differences(offered, asked))
+
+
+class StrangerCheck:
+    """Names publishers on the topics of connections that are not of their nodes, once each."""
+
+    def __init__(self, ros_node: RosNode, loop: RosLoop) -> None:
+        self._ros_node = ros_node
+        self._loop = loop
+        self._named: set[tuple[str, str]] = set()
+        self._pending: list[Callable[[], object]] = []
+
+    def callbacks(
+        self, connection: Connection, topic: str, *writers: str
+    ) -> SubscriptionEventCallbacks:
+        """For the subscription to a topic on which only the nodes ``writers`` publish."""
+
+        def on_matched(event: Any) -> None:
+            if event.current_count <= len(writers):
+                return
+            looks = 0
+
+            def look(*, is_last: bool = False) -> None:
+                nonlocal looks
+                looks += 1
+                listed = self._ros_node.get_publishers_info_by_topic(topic)
+                names = Counter(each.node_name for each in listed) - Counter(writers)
+                if _UNKNOWN_NODE not in names or looks == _MOST_QOS_LOOKS or is_last:
+                    self._ros_node.destroy_timer(timer)
+                    self._pending.remove(at_end)
+                    self._name(connection, topic, names)
+
+            at_end = partial(look, is_last=True)
+            self._pending.append(at_end)
+            timer = self._loop.every(self._ros_node, _QOS_LOOK_S, look)
+
+        return SubscriptionEventCallbacks(matched=on_matched)
+
+    def close(self) -> None:
+        """Name those of whom the ROS graph does not know the node yet, too."""
+        for look in tuple(self._pending):
+            look()
+
+    def _name(self, connection: Connection, topic: str, names: Iterable[str]) -> None:
+        new = sorted({(topic, name) for name in names} - self._named)
+        if new:
+            self._named.update(new)
+            others = " and ".join(
+                "a program that is no ROS node" if name == _UNKNOWN_NODE else name
+                for _, name in new
+            )
+            self._ros_node.get_logger().warning(
+                f"{connection}: on {topic}, others publish, too: {others}. What they send there"
+                " counts as sent by the node of the connection. --isolate keeps others out"
+            )
 
 
 def _check_silence(ros_node: RosNode, heard: Mapping[Port, Subscription], loop: RosLoop) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -80,13 +79,6 @@ class TestRosTransport(TransportChecks):
 
     def network(self, files: Sequence[NodeFile]) -> RosNetwork:
         return RosNetwork([[file] for file in files], in_memory=False)
-
-
-class TestRosTransportBetweenLaunchers(TransportChecks):
-    """Nodes of other launchers, which have no keys in common."""
-
-    def network(self, files: Sequence[NodeFile]) -> RosNetwork:
-        return RosNetwork([[replace(file, keys={})] for file in files], in_memory=False)
 
 
 class TestMemoryTransportOnRos(TransportChecks):
