@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
 
 Packet: TypeAlias = Any  # one ROS message
-HookFunction: TypeAlias = "Callable[..., Any]"  # gets the node and its inputs, returns packets
 
 
 class Logger(Protocol):
@@ -55,9 +54,6 @@ class Transport(Protocol):
 
     def open(self, inbox: Inbox) -> None:
         """Create the endpoints and begin to announce this node to its neighbours."""
-
-    def watched(self, function: HookFunction) -> HookFunction:
-        """The function to call in place of a hook, if the transport looks at what that returns."""
 
     def sender(self, connections: Sequence[Connection]) -> Callable[[Packet], bytes | None]:
         """The function that sends a packet on connections of one output; may return its bytes."""
@@ -107,8 +103,8 @@ class Packets(Protocol):
         It returns the packet, with the values that its receivers see; raises ``WrongValue``.
         """
 
-    def copy(self, packet: Packet) -> Packet:
-        """A packet that shares nothing with this one, which has been checked."""
+    def copier(self, type_name: str) -> Callable[[Packet], Packet]:
+        """A function from a checked packet of a type to one that shares nothing with it."""
 
     def encode(self, packet: Packet) -> bytes:
         """A packet as ROS serialises it."""

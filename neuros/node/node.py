@@ -363,9 +363,8 @@ class NodeRuntime:
         """The engine for the hooks of now."""
         node = self.file.node
         types = {port.name: self._packet_type(port) for port in node.outputs}
-        specs = [self._watched(spec) if spec.outputs else spec for spec in self.specs]
         self.engine = self._services.engine = self._make_engine(
-            node, self.file.connections, specs, self._effects, self._clock, types
+            node, self.file.connections, self.specs, self._effects, self._clock, types
         )
         if self._is_held:
             self.engine.pause()
@@ -388,9 +387,6 @@ class NodeRuntime:
         own = [c for c in self.file.connections if c.source_node == self.file.node.name]
         for_jpeg = any(c.is_jpeg for c in own if c.source_output == port.name)
         return PacketType(kind, packets.checker(kind, for_jpeg=for_jpeg))
-
-    def _watched(self, spec: HookSpec) -> HookSpec:
-        return replace(spec, function=self._transport.watched(spec.function))
 
     @property
     def _loaded(self) -> Engine:
@@ -424,7 +420,7 @@ class NodeEffects:
         on_ready: Callable[[], object],
         on_initialised: Callable[[], None],
     ) -> None:
-        self._loop, self._copy = middleware.loop, middleware.packets.copy
+        self._loop, self._copier = middleware.loop, middleware.packets.copier
         self._transport = transport
         self._handle = handle
         self._guard = failures.guard
@@ -512,13 +508,13 @@ class NodeEffects:
         self._loop.post_loop_back(partial(self._guard, event))
 
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
+        port = self._handle.description.output(connection.source_output)
         tap = self._taps_to_itself.get(connection)
         if tap is None:
-            port = self._handle.description.output(connection.source_output)
             tap = self._taps_to_itself[connection] = self.tap(Way.TO_ITSELF, port, connection)
         for observe in tap.observers:
             observe(packet, None)
-        return self._copy(packet)
+        return self._copier(port.type)(packet)
 
 
 def _to_nobody(packet: Any) -> None:

@@ -250,7 +250,7 @@ class Workbench(WithoutPeers):
         self.loop = loop
         self.topics = topics
         self.packets = RosPackets()
-        self.hub = MemoryHub(loop, self.packets.copy)
+        self.hub = MemoryHub(loop, self.packets.copier)
         self._log = log
         self._ros_nodes: dict[str, RosNodeStandIn] = {}
 

@@ -379,7 +379,7 @@ class Buffer(Part):
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
         values = self.get(message)
-        if type(values) is not array:  # it lies in shared memory still
+        if type(values) is not array:
             raise Unusual
         at = _write_length(len(values), pieces, at)
         if not values:

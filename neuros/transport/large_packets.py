@@ -3,8 +3,8 @@
 DDS copies a large message six or seven times on its way from one Python to another. Here the sender
 copies each buffer once, into a slot of a :mod:`segment <neuros.transport.message_buffers>`, and
 publishes on the data topic a *parcel*: the serialised message with empty buffers, and
-behind it a note of where they are. The receiver copies them out, as it takes the parcel, before
-it acknowledges anything.
+behind it a note of where they are. The receiver copies them out as soon as the parcel arrives, and
+so before it acknowledges anything.
 
 A parcel is told from an ordinary serialised message by the two option bytes of its encapsulation
 header, which are zero in the plain CDR of ROS (DDSI-RTPS 2.3, 10.5). A reader that knows nothing of
@@ -18,12 +18,10 @@ import os
 import platform
 import struct
 from array import array
-from collections import deque
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
-from weakref import ReferenceType, ref
 
 from neuros.errors import ProtocolError
 from neuros.project.model import Connection, NodeFile
@@ -35,7 +33,6 @@ from neuros.transport.message_buffers import (
     Place,
     SegmentReader,
     SegmentWriter,
-    StoredBuffer,
     message_buffers,
 )
 from neuros.transport.messages import message_class
@@ -101,10 +98,8 @@ class LargeOutput:
 class LargeInput:
     """The packets that arrive on one connection, with their buffers.
 
-    On a reliable connection the buffers stay in shared memory until a plugin reads them, or at the
-    latest until the hook after is about to start: the sender writes there only once that is
-    acknowledged.
-    On one of best effort they are copied at once, and a packet that was overtaken counts as lost.
+    The sender of a reliable connection writes into their slot again only after the packet is
+    acknowledged. On a connection of best effort, a packet that was overtaken counts as lost.
     """
 
     def __init__(
@@ -119,9 +114,6 @@ class LargeInput:
         self._buffers = buffers
         self._is_reliable = is_reliable
         self._reader = SegmentReader(folder)
-        self._received = 0
-        # What may still be in shared memory: the packet's number, and its buffers.
-        self._stored: deque[tuple[int, list[ReferenceType[StoredBuffer]]]] = deque()
 
     def decode(self, data: bytes) -> Any | None:
         """The next packet, from a parcel or a whole message.
@@ -130,40 +122,25 @@ class LargeInput:
         connection of best effort, it was overtaken.
 
         Raises:
-            ProtocolError: if the parcel is broken, or its segment cannot be read.
+            ProtocolError: if the parcel is broken, its segment cannot be read, or its sender has
+                overwritten it on a reliable connection.
         """
-        self._received += 1
         if not is_parcel(data):
             return self._plain.decode(data)
         try:
             message, place = _contents(data)
-            buffers = self._reader.find(place, self._buffers.typecodes)
-            if buffers is None:
-                return None
-            if self._is_reliable:
-                self._stored.append((self._received, [ref(buffer) for buffer in buffers]))
-            else:
-                for buffer in buffers:
-                    buffer.fetch()
+            buffers = self._reader.read(place, self._buffers.typecodes)
         except Overwritten:
+            if self._is_reliable:
+                raise
             return None
         except (OSError, ValueError, struct.error) as error:
             raise ProtocolError(f"a large packet cannot be read: {error}") from error
+        if buffers is None:
+            return None
         packet = self._plain.decode(message)
         self._buffers.put_back(packet, buffers)
         return packet
-
-    def settle(self, position: int) -> None:
-        """Copy what is still in use of the packets before ``position``: it gets acknowledged.
-
-        Raises:
-            ProtocolError: if that has been overwritten.
-        """
-        while self._stored and self._stored[0][0] < position:
-            for reference in self._stored.popleft()[1]:
-                buffer = reference()
-                if buffer is not None:
-                    buffer.fetch()
 
     def close(self) -> None:
         """Give up the shared memory."""
@@ -263,10 +240,10 @@ def machine_token(folder: Path = SHARED_MEMORY) -> str:
 def slots_for(connections: Sequence[Connection]) -> int:
     """The slots that an output with these connections needs.
 
-    What is outstanding on a reliable connection, its window, and the packet before, which a hook
-    may be working on; for one of best effort one more, since its sender does not wait for the copy.
+    What is outstanding on a reliable connection, its window; for one of best effort two more, since
+    its sender does not wait for the copy.
     """
-    return max(each.window + (1 if each.is_reliable else 2) for each in connections)
+    return max(each.window + (0 if each.is_reliable else 2) for each in connections)
 
 
 def _is_large(buffers: Sequence[array[Any]]) -> bool:

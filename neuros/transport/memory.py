@@ -1,7 +1,7 @@
 """The in-memory transport: packets within one process, in the order in which they were sent.
 
-rclcpp calls it intra-process communication. It needs no ROS itself: its user passes the function
-that copies a packet. So it is also the deterministic transport of the tests.
+rclcpp calls it intra-process communication. It needs no ROS itself: its user passes what
+copies packets. So it is also the deterministic transport of the tests.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any, Protocol
 
 from neuros.ports import EventLoop, Inbox
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.ownership import Given
 
 
 class GraphBridge(Protocol):
@@ -34,7 +33,8 @@ class MemoryHub:
 
     Args:
         loop: where packets and acknowledgements are events.
-        copy: what it returns must share nothing with its argument.
+        copier: makes, for a type in ROS notation, the function that copies its packets. A copy must
+            share nothing with the packet.
 
     Attributes:
         arrivals: what is on its way to each node.
@@ -43,11 +43,11 @@ class MemoryHub:
     def __init__(
         self,
         loop: EventLoop,
-        copy: Callable[[Any], Any],
+        copier: Callable[[str], Callable[[Any], Any]],
     ) -> None:
         self.loop = loop
         self.post = loop.post
-        self.copy = copy
+        self.copier = copier
         self.arrivals: dict[str, _Arrivals] = defaultdict(_Arrivals)
         self.inboxes: dict[str, Inbox] = {}
         self._links: dict[Connection, MemoryLink] = {}
@@ -93,7 +93,7 @@ class MemoryTransport:
         digest: Callable[[Any], int | None] | None = None,
         digests_of: Callable[[Connection], bool] = lambda _: True,
     ) -> None:
-        self._name = file.node.name
+        self._node, self._name = file.node, file.node.name
         self._loop = hub.loop
         self._arrivals = hub.arrivals[file.node.name]
         self._connections = file.connections
@@ -101,8 +101,6 @@ class MemoryTransport:
         self._bridge = bridge
         self._is_open = False
         self._is_turn_of_others = False
-        self._given = Given()
-        self.watched = self._given.watched
         self._digest = digest
         self.compressed: dict[str, tuple[int, int]] = {}  # nothing leaves the machine
         self.digests: dict[Connection, array[int]] = {}
@@ -119,21 +117,20 @@ class MemoryTransport:
         self._hub.join(self._name, inbox, self._connections)
 
     def sender(self, connections: Sequence[Connection]) -> Callable[[Any], None]:
-        """Return what gives each receiver a copy, but the last one the packet if it is unshared."""
+        """Return what gives each receiver a copy of a packet, which its sender may keep."""
         if any(c.is_jpeg for c in connections):
             return self._sender_with_jpeg(connections)
         links = [self._hub.link(c) for c in connections]
         digested = [link for link in links if link.connection in self.digests]
-        others, last = links[:-1], links[-1]
-        copy, take, bridge = self._hub.copy, self._given.take, self._bridge
+        copy = self._hub.copier(self._node.output(connections[0].source_output).type)
+        bridge = self._bridge
 
         def send(packet: Any) -> None:
             if not self._is_open:
                 return
             digest = self._note_digest(digested, packet) if digested else None
-            for link in others:
+            for link in links:
                 link.send(copy(packet), digest)
-            last.send(packet if take(packet) else copy(packet), digest)
             if bridge.heard:
                 bridge.show(connections, packet)
 
@@ -215,7 +212,6 @@ class MemoryTransport:
     def close(self) -> None:
         """Send and receive nothing any more."""
         self._is_open = False
-        self._given.clear()
         self._hub.leave(self._name)
         self._bridge.close()
 

@@ -1,4 +1,4 @@
-"""Buffers of a message, its sequences of numbers: found, left out, and put back as lazy ones.
+"""Buffers of a message, its sequences of numbers: in the message, and in shared memory.
 
 Pixels, points and scans are fields of the kind ``uint8[]`` or ``float32[]``: sequences without a
 bound, which Python holds as ``array.array``. Which fields of a message type those are is found out
@@ -13,7 +13,7 @@ import os
 import re
 import stat
 from array import array
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -44,10 +44,6 @@ class MessageBuffers:
         self.typecodes = tuple(leaf.field.type.code for leaf in found)
         self._kind = kind
         self._get = getter(self._paths)
-        holders: dict[tuple[str, ...], tuple[str, ...]] = {}
-        for *path, slot in self._paths:
-            holders[tuple(path)] = (*holders.get(tuple(path), ()), slot)
-        self._holders = holders
 
     def of(self, packet: Any) -> Sequence[array[Any]] | None:
         """The buffers of a message; ``None`` if one is not the array that ROS makes of it."""
@@ -59,25 +55,14 @@ class MessageBuffers:
             return None
         found: list[array[Any]] = []
         for value, typecode in zip(values, self.typecodes, strict=True):
-            buffer = value.fetch() if type(value) is StoredBuffer else value
-            if type(buffer) is not array or buffer.typecode != typecode:
+            if type(value) is not array or value.typecode != typecode:
                 return None
-            found.append(buffer)
+            found.append(value)
         return found
 
     def views(self, packet: Any) -> Sequence[memoryview]:
         """The bytes of the buffers of a message, where they lie; of what is no buffer, none."""
-        try:
-            values = self._get(packet)
-        except AttributeError:
-            return ()
-        views: list[memoryview] = []
-        for value in values:
-            if isinstance(value, StoredBuffer):
-                views.append(value.view())
-            elif isinstance(value, array):
-                views.append(memoryview(value).cast("B"))
-        return views
+        return [memoryview(buffer).cast("B") for buffer in self.of(packet) or ()]
 
     def leave_out(self, packet: Any) -> Any:
         """A message like this one with empty buffers, which shares all else with it."""
@@ -86,12 +71,13 @@ class MessageBuffers:
             values[place] = array(typecode)
         return self._layout.make(values)
 
-    def put_back(self, packet: Any, buffers: Sequence[StoredBuffer]) -> None:
-        """Give a message these buffers; they are copied when one of them is asked for."""
-        for path, buffer in zip(self._paths, buffers, strict=True):
-            setattr(_follow(packet, path[:-1]), path[-1], buffer)
-        for path, slots in self._holders.items():
-            _make_lazy(_follow(packet, path), slots)
+    def put_back(self, packet: Any, buffers: Sequence[array[Any]]) -> None:
+        """Give a message these buffers."""
+        for (*path, slot), buffer in zip(self._paths, buffers, strict=True):
+            holder = packet
+            for each in path:
+                holder = getattr(holder, each)
+            setattr(holder, slot, buffer)
 
 
 @cache
@@ -99,69 +85,6 @@ def message_buffers(kind: type) -> MessageBuffers | None:
     """The buffers of a message class, ``None`` if it has none."""
     buffers = MessageBuffers(kind)
     return buffers if buffers.fields else None
-
-
-def _follow(message: Any, path: Sequence[str]) -> Any:
-    for slot in path:
-        message = getattr(message, slot)
-    return message
-
-
-def _make_lazy(message: Any, slots: tuple[str, ...]) -> None:
-    """Turn a message into a lazy one: it copies its stored buffers when a plugin asks for one.
-
-    A message that is only passed on, or of which a plugin reads the header alone, is never copied.
-    Until then its class is one derived from that of ROS, with a property for each buffer. The first
-    access to any of them puts all into place and gives the message the class of ROS: the class of
-    an object may change where the layout is equal.
-    """
-    kind: Any = type(message)
-    message.__class__ = _lazy_class(kind, slots)
-
-
-@cache
-def _lazy_class(kind: Any, slots: tuple[str, ...]) -> type:
-    def complete(message: Any) -> None:
-        for slot in slots:
-            value = getattr(message, slot, None)  # none yet while it is being created
-            if type(value) is StoredBuffer:
-                setattr(message, slot, value.fetch())
-        message.__class__ = kind
-
-    def compare(message: Any, other: object) -> bool:
-        complete(message)
-        return bool(message == other)
-
-    def reduce(message: Any, protocol: Any) -> Any:
-        complete(message)
-        return message.__reduce_ex__(protocol)
-
-    content = {
-        "__slots__": (),
-        "__module__": kind.__module__,
-        "__qualname__": kind.__qualname__,
-        "__doc__": kind.__doc__,
-        "__eq__": compare,
-        "__hash__": None,
-        "__reduce_ex__": reduce,
-        **{slot[1:]: _property(slot[1:], complete) for slot in slots},
-    }
-    lazy: Any = type(kind)(kind.__name__, (kind,), content)
-    lazy.__slots__ = kind.__slots__  # what people list the fields of a message by
-    assert isinstance(lazy, type)
-    return lazy
-
-
-def _property(name: str, complete: Callable[[Any], None]) -> property:
-    def get(message: Any) -> Any:
-        complete(message)
-        return getattr(message, name)
-
-    def put(message: Any, value: Any) -> None:
-        complete(message)
-        setattr(message, name, value)
-
-    return property(get, put)
 
 
 # ---------------------------------------------------------------------- shared memory
@@ -278,18 +201,18 @@ class SegmentReader:
         self._folder = folder
         self._mapping: _Mapping | None = None
 
-    def find(self, place: Place, typecodes: Sequence[str]) -> list[StoredBuffer] | None:
-        """The buffers at a place, of these types, still in shared memory.
+    def read(self, place: Place, typecodes: Sequence[str]) -> list[array[Any]] | None:
+        """Copies of the buffers at a place, of these types.
 
         ``None`` if the whole segment is gone: its sender has ended, or uses a larger one.
 
         Raises:
+            Overwritten: if the slot has been used again.
             OSError: if the segment cannot be mapped.
             ValueError: if the place is not within the segment.
         """
         mapping = self._mapping
         if mapping is None or mapping.name != place.segment:
-            # What was found in the former one keeps that mapped for as long as it needs it.
             try:
                 mapping = self._mapping = _open(self._folder, place)
             except FileNotFoundError:
@@ -297,57 +220,21 @@ class SegmentReader:
         start = place.slot * place.slot_bytes
         if start + _span(place.lengths) > mapping.bytes.nbytes:
             raise ValueError(f"{place} ends beyond its segment")
-        found: list[StoredBuffer] = []
+        found: list[array[Any]] = []
         at = start + _HEADER_BYTES
+        was_there = mapping.generations[start // 8] == place.generation
         for typecode, length in zip(typecodes, place.lengths, strict=True):
-            if length % array(typecode).itemsize:
-                raise ValueError(f"{place} has parts of numbers")
-            found.append(StoredBuffer(mapping, start // 8, place.generation, at, length, typecode))
+            buffer = array(typecode)
+            buffer.frombytes(mapping.bytes[at : at + length])
+            found.append(buffer)
             at += _aligned(length)
+        if not was_there or mapping.generations[start // 8] != place.generation:
+            raise Overwritten(f"packet {place.generation} of {place.segment} has been overwritten")
         return found
 
     def close(self) -> None:
         """Give up the mapping."""
         self._mapping = None
-
-
-class StoredBuffer:
-    """A buffer in shared memory, copied out when it is first asked for, and then kept."""
-
-    __slots__ = ("__weakref__", "_array", "_at", "_generation", "_index", "_length", "_mapping")
-
-    def __init__(
-        self, mapping: _Mapping, index: int, generation: int, at: int, length: int, typecode: str
-    ) -> None:
-        self._mapping: _Mapping | None = mapping
-        self._index = index
-        self._generation = generation
-        self._at = at
-        self._length = length
-        self._array: array[Any] = array(typecode)
-
-    def fetch(self) -> array[Any]:
-        """The buffer as an array, always one object.
-
-        Raises:
-            Overwritten: if its slot has been used again.
-        """
-        mapping = self._mapping
-        if mapping is None:
-            return self._array
-        if mapping.generations[self._index] == self._generation:
-            self._array.frombytes(mapping.bytes[self._at : self._at + self._length])
-            if mapping.generations[self._index] == self._generation:
-                self._mapping = None
-                return self._array
-            del self._array[:]
-        raise Overwritten(f"packet {self._generation} of {mapping.name} has been overwritten")
-
-    def view(self) -> memoryview:
-        """The bytes where they are: nothing is copied, and they may be overwritten."""
-        if self._mapping is None:
-            return memoryview(self._array).cast("B")
-        return self._mapping.bytes[self._at : self._at + self._length]
 
 
 class _Mapping:

@@ -108,8 +108,8 @@ class RosPackets:
             return jpeg_checker()
         return checker(kind)
 
-    def copy(self, packet: Any) -> Any:
-        return copy_packet(packet)
+    def copier(self, type_name: str) -> Copy:
+        return _copier(message_class(type_name))
 
     def encode(self, packet: Any) -> bytes:
         kind: type = type(packet)

@@ -16,7 +16,7 @@ from typing import Any
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from neuros.ports import HookFunction, Inbox, Voice
+from neuros.ports import Inbox, Voice
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.lean_node import give_up, lean_node, without_spinning
 from neuros.transport.messages import RosPackets
@@ -79,9 +79,6 @@ class _NullTransport:
     def note_execution(self) -> None: ...
 
     def give_way(self) -> None: ...
-
-    def watched(self, function: HookFunction) -> HookFunction:
-        return function
 
     def has_taken_in(self) -> bool:
         return True

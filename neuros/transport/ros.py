@@ -27,12 +27,12 @@ from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 from std_msgs.msg import String, UInt64
 
-from neuros.ports import HookFunction, Inbox
+from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.transport.codecs import Codec, Decoder, Encoder, message_codec
 from neuros.transport.digests import Digest, digest_for, digest_of_data, make_digests
 from neuros.transport.envelope import Compressor, Traffic, compressing, decompressing
-from neuros.transport.large_packets import LargeCodecs, LargeInput, is_parcel, machine_token
+from neuros.transport.large_packets import LargeCodecs, is_parcel, machine_token
 from neuros.transport.messages import message_class
 from neuros.transport.ros_graph import ExternalTopics, StrangerCheck, data_qos, is_compatible
 from neuros.transport.ros_loop import RosLoop
@@ -79,7 +79,6 @@ class ReceivingLink:
         digests: array[int],
     ) -> None:
         self._decode = codec.decode
-        self._settle = codec.settle if isinstance(codec, LargeInput) else None
         self._digest = digest
         self._deliver = deliver
         self._note = digests.append
@@ -94,8 +93,6 @@ class ReceivingLink:
 
     def acknowledge(self, position: int) -> None:
         """Publish the position that every taker has reached."""
-        if self._settle is not None:
-            self._settle(position)
         self.publish_position(position)
 
 
@@ -173,10 +170,6 @@ class RosTransport:
         if self._registrations:
             self._loop.expect_arrivals()
             self._timer = self._loop.every(self._ros_node, _ANNOUNCE_S, self._look_for_others)
-
-    def watched(self, function: HookFunction) -> HookFunction:
-        """The function itself: what is sent leaves as bytes."""
-        return function
 
     def sender(self, connections: Sequence[Connection]) -> Callable[[Any], bytes | None]:
         """Return what publishes a packet on these data topics, serialised once.

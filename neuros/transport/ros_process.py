@@ -99,7 +99,7 @@ class RosProcess:
         is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
         self._tried_digest = TriedDigest() if is_lossless and not record else None
         self._is_recorded = record
-        self._hub = MemoryHub(self.loop, self.packets.copy) if in_memory else None
+        self._hub = MemoryHub(self.loop, self.packets.copier) if in_memory else None
         self._ros_nodes: dict[str, LeanNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []

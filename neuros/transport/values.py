@@ -299,10 +299,6 @@ def _convert_message(kind: Any) -> Convert:
 
 def _of_very_class(message: Any, kind: Any) -> Any:
     """A message that is of a derived class, as one of the class itself."""
-    for name in kind.get_fields_and_field_types():
-        getattr(message, name, None)  # one that came through shared memory is completed by that
-    if type(message) is kind:
-        return message
     twin: Any = object.__new__(kind)
     for slot in kind.__slots__:
         if hasattr(message, slot):

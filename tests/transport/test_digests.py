@@ -71,7 +71,6 @@ def test_a_parcel_has_the_digest_of_the_whole_message_at_both_ends(
     assert digest_for(Image)(packet, data) == whole
     assert digest_for(Image)(received, data) == whole
     assert received == packet
-    assert digest_for(Image)(received, data) == whole, "also once its buffers have been fetched"
     receiver.close()
     sender.close()
 

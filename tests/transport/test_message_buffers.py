@@ -1,9 +1,8 @@
-"""Buffers are found in messages, taken out and put back, and a lazy message is like any other."""
+"""Buffers are found in messages, left out and put back."""
 
 from __future__ import annotations
 
 import copy
-import pickle
 from array import array
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,7 @@ from std_msgs.msg import ByteMultiArray, Float64MultiArray, String
 from stereo_msgs.msg import DisparityImage
 
 from neuros.transport.message_buffers import SegmentReader, SegmentWriter, message_buffers
-from neuros.transport.messages import copy_packet, message_class
-from neuros.transport.values import checker
+from neuros.transport.messages import message_class
 
 message_class("sensor_msgs/msg/Image")  # loads what ROS needs for its first message
 
@@ -104,74 +102,14 @@ def test_what_is_not_the_array_of_ros_is_not_taken() -> None:
     assert disparity.of(odd) is None
 
 
-def lazy(packet: Any, folder: Path) -> Any:
-    """The message as a receiver gets it: its buffers still in shared memory."""
+@pytest.mark.parametrize("packet", MESSAGES, ids=lambda packet: type(packet).__name__)
+def test_a_message_whose_buffers_went_through_shared_memory_is_the_message(
+    packet: Any, tmp_path: Path
+) -> None:
     buffers = message_buffers(type(packet))
     assert buffers is not None
-    found = buffers.of(packet)
-    assert found is not None
-    place = SegmentWriter("owner", 1, folder).write(found)
-    twin = deserialize_message(serialize_message(buffers.leave_out(packet)), type(packet))
-    stored = SegmentReader(folder).find(place, buffers.typecodes)
-    assert stored is not None
-    buffers.put_back(twin, stored)
-    return twin
-
-
-@pytest.mark.parametrize("packet", MESSAGES, ids=lambda packet: type(packet).__name__)
-class TestLazyMessages:
-    """Whatever is done to a lazy message first, it is the message that was sent."""
-
-    def test_it_is_of_its_class(self, packet: Any, tmp_path: Path) -> None:
-        message = lazy(packet, tmp_path)
-        assert isinstance(message, type(packet))
-        assert type(message).__name__ == type(packet).__name__
-        assert type(message).__module__ == type(packet).__module__
-        assert message.__slots__ == packet.__slots__
-
-    def test_it_equals(self, packet: Any, tmp_path: Path) -> None:
-        assert lazy(packet, tmp_path) == packet
-        assert packet == lazy(packet, tmp_path)
-        assert lazy(packet, tmp_path) != type(packet)()
-
-    def test_it_reads_the_same(self, packet: Any, tmp_path: Path) -> None:
-        assert repr(lazy(packet, tmp_path)) == repr(packet)
-
-    def test_it_is_serialised(self, packet: Any, tmp_path: Path) -> None:
-        assert travelled(lazy(packet, tmp_path), type(packet)) == packet
-
-    def test_it_is_copied(self, packet: Any, tmp_path: Path) -> None:
-        for made in (
-            copy.copy,
-            copy.deepcopy,
-            lambda m: copy_packet(checker(type(packet))(m)),
-            lambda m: pickle.loads(pickle.dumps(m)),
-        ):
-            twin = made(lazy(packet, tmp_path))
-            assert type(twin) is type(packet)
-            assert twin == packet
-
-    def test_its_buffers_can_be_sent_on(self, packet: Any, tmp_path: Path) -> None:
-        buffers = message_buffers(type(packet))
-        assert buffers is not None
-        assert buffers.of(lazy(packet, tmp_path)) == buffers.of(packet)
-        serialize_message(buffers.leave_out(lazy(packet, tmp_path)))
-
-
-def test_fields_of_a_late_message_may_be_set(tmp_path: Path) -> None:
-    message = lazy(_scan(), tmp_path)
-    message.ranges = array("f", [9.0])
-    assert list(message.ranges) == [9.0]
-    assert list(message.intensities) == [7.0]
-    assert type(message) is LaserScan
-    message = lazy(_image(), tmp_path)
-    message.height = 7
-    assert message.data == _image().data
-
-
-def test_a_buffer_is_an_array_that_may_be_changed_and_stays_the_same_one(tmp_path: Path) -> None:
-    message = lazy(_image(), tmp_path)
-    message.data[0] = 99
-    assert type(message.data) is array
-    assert message.data[0] == 99
-    assert message.data is message.data
+    place = SegmentWriter("owner", 1, tmp_path).write(buffers.of(packet) or [])
+    twin = travelled(buffers.leave_out(packet), type(packet))
+    buffers.put_back(twin, SegmentReader(tmp_path).read(place, buffers.typecodes) or [])
+    assert twin == packet
+    assert buffers.of(twin) == buffers.of(packet)

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.transport.message_buffers import Overwritten, Place, SegmentReader, SegmentWriter
+from neuros.transport.message_buffers import Overwritten, SegmentReader, SegmentWriter
 
 TYPES = "B", "d"
 
@@ -22,11 +22,6 @@ TYPES = "B", "d"
 def _packet(number: int, size: int) -> list[array[Any]]:
     """Two buffers that tell which packet they belong to."""
     return [array("B", bytes([number % 256]) * size), array("d", [float(number)] * (size % 7))]
-
-
-def _read(reader: SegmentReader, place: Place) -> list[array[Any]] | None:
-    found = reader.find(place, TYPES)
-    return None if found is None else [buffer.fetch() for buffer in found]
 
 
 @pytest.fixture
@@ -60,7 +55,7 @@ def test_a_packet_is_read_as_it_was_written_until_as_many_as_slots_have_followed
             asked = data.draw(st.integers(0, number))
             is_kept = asked > number - slots
             try:
-                found = _read(reader, places[asked])
+                found = reader.read(places[asked], TYPES)
             except Overwritten:
                 assert not is_kept
             else:
@@ -72,43 +67,31 @@ def test_a_packet_is_read_as_it_was_written_until_as_many_as_slots_have_followed
     assert not list(folder.iterdir())
 
 
-def test_a_buffer_that_nobody_asks_for_in_time_is_overwritten(
+def test_a_packet_that_is_read_too_late_is_overwritten(
     tmp_path: Path, writer: SegmentWriter
 ) -> None:
     reader = SegmentReader(tmp_path)
-    found = reader.find(writer.write(_packet(1, 100)), TYPES)
-    assert found is not None
-    late, _ = found
+    late = writer.write(_packet(1, 100))
     writer.write(_packet(2, 100))
     writer.write(_packet(3, 100))
     with pytest.raises(Overwritten):
-        late.fetch()
-
-
-def test_a_buffer_that_was_fetched_stays(tmp_path: Path, writer: SegmentWriter) -> None:
-    found = SegmentReader(tmp_path).find(writer.write(_packet(1, 100)), TYPES)
-    assert found is not None
-    kept = found[0].fetch()
-    for number in range(2, 6):
-        writer.write(_packet(number, 100))
-    writer.close()
-    assert found[0].fetch() is kept
-    assert kept == _packet(1, 100)[0]
+        reader.read(late, TYPES)
 
 
 def test_what_is_mapped_stays_readable_after_the_sender_has_ended(
     tmp_path: Path, writer: SegmentWriter
 ) -> None:
-    found = SegmentReader(tmp_path).find(writer.write(_packet(1, 100)), TYPES)
-    assert found is not None
+    reader = SegmentReader(tmp_path)
+    reader.read(writer.write(_packet(1, 100)), TYPES)
+    place = writer.write(_packet(2, 100))
     writer.close()
-    assert [buffer.fetch() for buffer in found] == _packet(1, 100)
+    assert reader.read(place, TYPES) == _packet(2, 100)
 
 
 def test_a_segment_that_is_gone_has_nothing(tmp_path: Path, writer: SegmentWriter) -> None:
     place = writer.write(_packet(1, 100))
     writer.close()
-    assert SegmentReader(tmp_path).find(place, TYPES) is None
+    assert SegmentReader(tmp_path).read(place, TYPES) is None
 
 
 def test_a_larger_packet_gets_a_larger_segment_and_the_former_goes_when_it_is_of_no_use(
@@ -146,7 +129,7 @@ def test_without_room_nothing_is_left_behind(
 def test_a_place_beyond_the_end_is_refused(tmp_path: Path, writer: SegmentWriter) -> None:
     place = writer.write(_packet(1, 100))
     with pytest.raises(ValueError, match="beyond"):
-        SegmentReader(tmp_path).find(dataclasses.replace(place, lengths=(100, 1 << 20)), TYPES)
+        SegmentReader(tmp_path).read(dataclasses.replace(place, lengths=(100, 1 << 20)), TYPES)
 
 
 def test_a_link_to_a_file_of_another_kind_is_not_followed(
@@ -156,7 +139,7 @@ def test_a_link_to_a_file_of_another_kind_is_not_followed(
     (tmp_path / place.segment).rename(tmp_path / "elsewhere")
     (tmp_path / place.segment).symlink_to(tmp_path / "elsewhere")
     with pytest.raises(OSError, match=place.segment):
-        SegmentReader(tmp_path).find(place, TYPES)
+        SegmentReader(tmp_path).read(place, TYPES)
 
 
 def _write_without_pause(folder: Path, pipe: Any) -> None:
@@ -179,15 +162,13 @@ def test_a_reader_that_is_overtaken_while_it_copies_never_gets_a_mix(tmp_path: P
     try:
         while read < 300 and read + overtaken < 100_000:
             place = here.recv()
-            found = reader.find(place, "B")
-            assert found is not None
             try:
-                content = found[0].fetch()
+                found = reader.read(place, "B")
             except Overwritten:
                 overtaken += 1
             else:
                 read += 1
-                assert content == array("B", bytes([place.generation % 256]) * 300_000)
+                assert found == [array("B", bytes([place.generation % 256]) * 300_000)]
     finally:
         here.close()
         child.terminate()

@@ -42,7 +42,6 @@ from neuros.errors import WrongValue
 from neuros.transport.codecs import message_codec
 from neuros.transport.digests import digest_for, digest_of
 from neuros.transport.messages import copy_packet
-from neuros.transport.ownership import unshared_check
 from neuros.transport.values import checker
 
 KINDS = message_classes()
@@ -434,9 +433,3 @@ class TestMessages:
             pose.position.x = number
         assert checked(poses).poses is held
         assert all(type(pose.position.x) is float for pose in held)
-
-    def test_nothing_of_a_packet_is_held_after_its_check(self) -> None:
-        for number in (1.0, 1):
-            packet = Imu()
-            packet.angular_velocity.x = number
-            assert unshared_check(type(packet))(checked(packet))
