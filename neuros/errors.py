@@ -178,3 +178,11 @@ def results_of(work: Sequence[Future[_Result]]) -> tuple[list[_Result], BaseExce
     if others or not errors:
         return results, next(iter(others), None)
     return results, EnvironmentFault("\n".join(dict.fromkeys(map(str, errors))))
+
+
+NO_WAITING = (
+    "NeuROS serves the callbacks of a node itself, between its hooks, so a hook must not wait for"
+    " them: let it return, and take an answer with"
+    " client.call_async(request).add_done_callback(function)"
+)
+"""What helps where a plugin waits for callbacks of its node."""

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TypeGuard
 
-from neuros.errors import NeurosError, NodeError, PluginError
+from neuros.errors import NO_WAITING, NeurosError, NodeError, PluginError
 from neuros.hooks import HookSpec, hook_specs_of
 
 PREFIX = "neuros_plugin_"
@@ -110,8 +110,11 @@ def _hint(error: BaseException) -> str:
             f"packages such as {top} go into the requirements.txt of the node's container, modules"
             " of your own beside the plugin: docs/environments.md"
         )
+    frames = traceback.extract_tb(error.__traceback__)
+    if any(frame.name == "get_global_executor" for frame in frames):  # by rclpy.spin and the like
+        return NO_WAITING
     if isinstance(error, FileNotFoundError) and _is_relative(error.filename):
-        if _innermost_file(error).endswith("/subprocess.py"):
+        if frames and frames[-1].filename.endswith("/subprocess.py"):
             return ""  # it is a program, and is looked for on the PATH
         name, folder = os.fsdecode(error.filename), os.path.realpath("/proc/self/cwd")
         return (
@@ -123,11 +126,6 @@ def _hint(error: BaseException) -> str:
 
 def _is_relative(name: object) -> TypeGuard[str | bytes]:
     return isinstance(name, str | bytes) and bool(name) and not os.path.isabs(name)
-
-
-def _innermost_file(error: BaseException) -> str:
-    frames = traceback.extract_tb(error.__traceback__)
-    return frames[-1].filename if frames else ""
 
 
 def last_line(error: BaseException, where: str) -> str:

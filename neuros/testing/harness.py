@@ -43,7 +43,6 @@ from neuros.testing.stand_ins import (
     with_neighbours,
     with_observer,
 )
-from neuros.transport.lean_node import without_spinning
 from neuros.transport.memory import MemoryHub
 from neuros.transport.messages import checked, copy_packet, message_class
 
@@ -510,8 +509,7 @@ class PluginHarness:
         folder = os.getcwd()
         os.chdir(self._file.folders.run)
         try:
-            with without_spinning():
-                yield
+            yield
         finally:
             self._contexts.leave()
             os.chdir(folder)

@@ -1,7 +1,7 @@
 """The lean ROS node of a NeuROS node, and the callbacks that a plugin registers there.
 
-It is rclpy's own, served by NeuROS and by nothing else. A hook that waits for a callback
-(``rclpy.spin_until_future_complete``) would wait for what comes after the hook: an error says so.
+It is rclpy's own, served by NeuROS and by no other executor. A hook that waits for a callback would
+wait for what comes after the hook: an error says so.
 
 It has services for parameters only where it has some. rclpy gives each node six of them: twelve of
 some twenty endpoints, which every process of a domain hears of from every other, and more than half
@@ -16,9 +16,7 @@ import inspect
 import os
 import threading
 import types
-from collections import deque
-from collections.abc import Callable, Coroutine, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Coroutine, Generator, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import rclpy
@@ -28,9 +26,8 @@ from rclpy.exceptions import ParameterNotDeclaredException as ParameterNotDeclar
 from rclpy.node import Node as RosNode
 from rclpy.parameter import Parameter as Parameter
 from rclpy.parameter_service import ParameterService
-from rclpy.subscription import Subscription
 
-from neuros.errors import NodeError
+from neuros.errors import NO_WAITING, NodeError
 from neuros.project.model import NodeFile, Value
 from neuros.project.names import Names
 from neuros.transport.executors import EXECUTOR_VARIABLE
@@ -40,16 +37,10 @@ _NO_NAMES = Names()
 _NOTHING: Mapping[str, Value] = types.MappingProxyType({})
 _OF_ROS = "use_sim_time"  # rclpy declares it itself
 
-_SPINNING = ("spin", "spin_once", "spin_until_future_complete")
-_lock = threading.Lock()
-_threads: list[int] = []
-"""Threads in which nothing may wait for callbacks; a thread is in there as often as it asked."""
-_replaced: dict[str, Callable[..., Any]] = {}
-
 Fail: TypeAlias = Callable[[Any, BaseException], None]
 
 # Methods that take a callback, and its place among their arguments.
-_CREATORS = (("create_timer", 1), ("create_service", 2))
+_CREATORS = (("create_timer", 1), ("create_subscription", 2), ("create_service", 2))
 
 
 class LeanNode(RosNode):  # type: ignore[misc]
@@ -110,7 +101,8 @@ class LeanNode(RosNode):  # type: ignore[misc]
     def executor(self, executor: Any) -> None:
         current = super().executor
         if current is not None and executor is not None and executor is not current:
-            raise _not_for_plugins(f"{type(executor).__name__}.add_node")
+            executor.remove_node(self)  # it has counted the node in already
+            raise _not_for_plugins(f"rclpy.spin or {type(executor).__name__}.add_node")
         RosNode.executor.fset(self, executor)
 
     def wrap_tasks(self, wrap: Callable[[Any], Any]) -> None:
@@ -139,38 +131,6 @@ def lean_node(file: NodeFile, context: Context) -> LeanNode:
     return LeanNode(file.node.name, context, file.names, file.node.parameters)
 
 
-@contextmanager
-def without_spinning() -> Iterator[None]:
-    """Meanwhile, ``rclpy.spin`` and the like are refused in this thread, and work in all others."""
-    thread = threading.get_ident()
-    with _lock:
-        if not _threads:
-            for name in _SPINNING:
-                _replaced[name] = getattr(rclpy, name)
-                setattr(rclpy, name, not_in_hooks(_replaced[name], f"rclpy.{name}"))
-        _threads.append(thread)
-    try:
-        yield
-    finally:
-        with _lock:
-            _threads.remove(thread)
-            if not _threads:
-                for name, replaced in _replaced.items():
-                    setattr(rclpy, name, replaced)
-
-
-def not_in_hooks(wait: Callable[..., Any], name: str) -> Callable[..., Any]:
-    """``wait``, refused in threads that run hooks."""
-
-    @functools.wraps(wait)
-    def waiting(*arguments: Any, **keywords: Any) -> Any:
-        if threading.get_ident() in _threads:
-            raise _not_for_plugins(name)
-        return wait(*arguments, **keywords)
-
-    return waiting
-
-
 class PluginCallbacks:
     """Wraps the callbacks of all that a plugin creates on its ROS node from now on.
 
@@ -190,9 +150,9 @@ class PluginCallbacks:
         self._enter = enter
         self._fail = fail
         self._is_over = False
+        self._thread = threading.get_ident()  # in which the loop runs hooks and callbacks
         for name, place in _CREATORS:
             setattr(ros_node, name, self._creating(getattr(ros_node, name), name, place))
-        ros_node.create_subscription = self._subscribing(ros_node.create_subscription)
         ros_node.create_client = self._creating_client(ros_node.create_client)
         ros_node.add_waitable = self._adding(ros_node.add_waitable)
         if loop.is_limited:
@@ -247,20 +207,6 @@ class PluginCallbacks:
 
         return creating
 
-    def _subscribing(self, create: Callable[..., Subscription]) -> Any:
-        @functools.wraps(create)
-        def subscribing(
-            msg_type: Any, topic: str, callback: Any, qos_profile: Any, *rest: Any, **keywords: Any
-        ) -> Subscription:
-            self._loop.expect_arrivals()
-            wrapped = self.wrapped(callback)
-            if callable(callback) and not inspect.iscoroutinefunction(callback):
-                depth = qos_profile if isinstance(qos_profile, int) else qos_profile.depth
-                wrapped = _Rationed(wrapped, self._loop, depth).receive(callback)
-            return create(msg_type, topic, wrapped, qos_profile, *rest, **keywords)
-
-        return subscribing
-
     def _answering(self, send_response: Callable[..., None]) -> Any:
         """A service does not answer after a failure."""
 
@@ -276,7 +222,7 @@ class PluginCallbacks:
             self._loop.expect_arrivals()
             client = create(*arguments, **keywords)
             client.call_async = self._calling(client.call_async)
-            client.call = not_in_hooks(client.call, "client.call")
+            client.call = self._calling_and_waiting(client.call)
             return client
 
         return creating
@@ -288,6 +234,15 @@ class PluginCallbacks:
             add = future.add_done_callback
             future.add_done_callback = lambda callback: add(self.wrapped(callback))
             return future
+
+        return calling
+
+    def _calling_and_waiting(self, call: Callable[..., Any]) -> Any:
+        @functools.wraps(call)
+        def calling(*arguments: Any, **keywords: Any) -> Any:
+            if threading.get_ident() == self._thread:
+                raise _not_for_plugins("client.call")
+            return call(*arguments, **keywords)
 
         return calling
 
@@ -355,50 +310,6 @@ class _EnteringSteps(Generator[Any, Any, Any]):
         return self.cr_await.throw(*error)
 
 
-class _Rationed:
-    """A callback of a subscription, called for at most ``depth`` messages in one turn of the loop.
-
-    rclpy queues an event for each message, and each event takes the newest there is. So with a
-    callback that takes longer than there is between two messages, hooks and timers would wait
-    ever longer. What comes beyond ``depth`` in a turn waits here for the next one, and takes the
-    place of what is older, as it would in DDS. A depth of 0 (KEEP_ALL) drops nothing.
-    """
-
-    def __init__(self, callback: Callable[..., Any], loop: RosLoop, depth: int) -> None:
-        self._callback = callback
-        self._loop = loop
-        self._depth = depth
-        self._waiting: deque[tuple[Any, ...]] = deque(maxlen=depth or None)
-        self._turn = -1
-        self._left = 0
-
-    def receive(self, callback: Any) -> Any:
-        """The callback for rclpy, which asks for the signature of the plugin's ``callback``."""
-
-        @functools.wraps(callback)
-        def receive(*message: Any) -> None:
-            if self._waiting or not self._may_call():
-                if not self._waiting:
-                    self._loop.post(self._catch_up)
-                self._waiting.append(message)
-            else:
-                self._callback(*message)
-
-        return receive
-
-    def _may_call(self) -> bool:
-        if self._turn != self._loop.turns:
-            self._turn, self._left = self._loop.turns, max(self._depth, 1)
-        self._left -= 1
-        return self._left >= 0
-
-    def _catch_up(self) -> None:
-        while self._waiting and self._may_call():
-            self._callback(*self._waiting.popleft())
-        if self._waiting:
-            self._loop.post(self._catch_up)
-
-
 def _refuse_guard_condition(*_: Any, **__: Any) -> Any:
     raise NodeError(_not_served("create_guard_condition", "guard conditions"))
 
@@ -411,11 +322,7 @@ def _not_served(name: str, what: str) -> str:
 
 
 def _not_for_plugins(name: str) -> NodeError:
-    return NodeError(
-        f"{name}: NeuROS serves the callbacks of a node itself, between its hooks, so a hook must"
-        " not wait for them: let it return, and take an answer with"
-        " client.call_async(request).add_done_callback(function)"
-    )
+    return NodeError(f"{name}: {NO_WAITING}")
 
 
 # ---------------------------------------------------------------------- end

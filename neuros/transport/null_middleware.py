@@ -7,7 +7,6 @@ callbacks that a plugin registers there are not served.
 
 from __future__ import annotations
 
-import contextlib
 import queue
 from array import array
 from collections.abc import Callable, Mapping, Sequence
@@ -18,7 +17,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from neuros.ports import Inbox, Voice
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.lean_node import give_up, lean_node, without_spinning
+from neuros.transport.lean_node import give_up, lean_node
 from neuros.transport.messages import RosPackets
 
 Event = Callable[[], None]
@@ -138,8 +137,6 @@ class NullMiddleware(WithoutPeers):
             signal_handler_options=SignalHandlerOptions.NO,
         )
         self._ros_node = lean_node(file, self._context)
-        self._no_spinning = contextlib.ExitStack()
-        self._no_spinning.enter_context(without_spinning())
 
     def transport(self, file: NodeFile) -> _NullTransport:
         return _NullTransport()
@@ -149,5 +146,4 @@ class NullMiddleware(WithoutPeers):
 
     def close(self) -> None:
         """Give up ROS."""
-        self._no_spinning.close()
         give_up(self._context, [self._ros_node])

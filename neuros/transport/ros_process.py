@@ -36,7 +36,6 @@ from neuros.transport.lean_node import (
     PluginCallbacks,
     give_up,
     lean_node,
-    without_spinning,
 )
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import RosPackets
@@ -104,8 +103,6 @@ class RosProcess:
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
         self._transports: list[Transport] = []
-        self._no_spinning = contextlib.ExitStack()
-        self._no_spinning.enter_context(without_spinning())
 
     def transport(self, file: NodeFile) -> Transport:
         ros_node = lean_node(file, self._context)
@@ -156,7 +153,6 @@ class RosProcess:
 
     def flush(self) -> None:
         """Send and receive nothing any more, and let what was sent last leave."""
-        self._no_spinning.close()
         for transport in self._transports:
             transport.close()
         self.loop.run_for(_LINGER_S)

@@ -12,7 +12,6 @@ import textwrap
 from pathlib import Path
 
 import pytest
-import rclpy
 from std_msgs.msg import Float64, Int32, String
 
 from neuros.errors import HookError, NodeError, PluginError, ProjectError
@@ -574,11 +573,11 @@ def failing(plugin, body, **arguments):
     return failed.value.text
 
 
-def test_a_hook_that_spins_is_told_what_to_do_and_the_test_may_spin(plugin):
-    before = rclpy.spin_once
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # of rclpy
+def test_a_hook_that_spins_is_told_what_to_do(plugin):
     told = failing(plugin, "rclpy.spin_once(node.get_ros_node())")
-    assert re.match("rclpy.spin_once: NeuROS serves .* itself, .*call_async", told)
-    assert rclpy.spin_once is before
+    assert re.search("NeuROS serves .* itself, .*call_async", told)
+    gc.collect()  # the executor that rclpy could not make warns when it goes
 
 
 def test_a_file_that_is_not_in_the_current_folder_is_looked_for_where_it_may_be(plugin, tmp_path):

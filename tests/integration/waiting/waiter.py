@@ -1,9 +1,8 @@
-"""Tries, in a hook, every way of waiting for a callback; in a thread of its own that works."""
+"""Tries, in hooks, ways of waiting for a callback; a node of its own is spun in a thread."""
 
 import threading
 
 import rclpy
-from rclpy import spin_once
 from rclpy.executors import SingleThreadedExecutor
 from std_srvs.srv import Trigger
 
@@ -17,12 +16,10 @@ def try_all(node):
     future = client.call_async(Trigger.Request())
     own = SingleThreadedExecutor(context=ros.context)
     for wait in (
-        lambda: rclpy.spin(ros),
-        lambda: spin_once(ros, timeout_sec=0.1),
-        lambda: rclpy.spin_until_future_complete(ros, future),
         lambda: client.call(Trigger.Request()),
         lambda: ros.executor.spin_once(timeout_sec=0.1),
-        lambda: own.add_node(ros),
+        lambda: rclpy.spin_once(ros, executor=own, timeout_sec=0.1),
+        lambda: rclpy.spin_until_future_complete(ros, future, own),
     ):
         try:
             wait()
@@ -56,7 +53,4 @@ def begin(node):
 
 @neuros_finalise()
 def end(node):
-    try:
-        rclpy.spin(node.get_ros_node())
-    except NodeError as error:
-        node.get_logger().info(f"refused: {error}")
+    rclpy.spin(node.get_ros_node())
