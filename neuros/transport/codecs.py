@@ -89,24 +89,30 @@ class MessageCodec:
 class CdrCodec(MessageCodec):
     """Messages in plain CDR by NeuROS itself, in a fraction of the time; the rest by rclpy."""
 
-    def __init__(self, kind: type, encode: Encode, decode: Decode) -> None:
+    def __init__(self, kind: type, parts: tuple[Part, ...]) -> None:
         super().__init__(kind)
-        self._encode = encode
-        self._decode = decode
+        self._writers = tuple(part.write for part in parts)
+        self._read = _reader(kind, parts)
 
     def encode(self, packet: Any) -> bytes:
         """The serialised message."""
         try:
-            return self._encode(packet)
-        except NOT_OURS:
+            if type(packet) is not self._kind:
+                raise Unusual
+            pieces: Pieces = [HEADER]
+            at = 0
+            for write in self._writers:
+                at = write(packet, pieces, at)
+            return b"".join(pieces)
+        except _NOT_OURS:
             return super().encode(packet)
 
     def decode(self, data: bytes) -> Any:
         """The message."""
-        try:
-            return self._decode(data)
-        except Unusual:
+        if data[:_START] != HEADER:
             return super().decode(data)
+        try:
+            return self._read(data, 0)[0]
         except (struct.error, ValueError) as error:
             raise WrongBytes(self._kind, data, error) from error
 
@@ -114,21 +120,21 @@ class CdrCodec(MessageCodec):
 @cache
 def message_codec(kind: type) -> Codec:
     """The plain codec for a message class."""
-    quick = cdr(kind)
-    return MessageCodec(kind) if quick is None else CdrCodec(kind, *quick)
+    try:
+        return CdrCodec(kind, _parts_of(kind))
+    except Unusual:
+        return MessageCodec(kind)
 
 
 # ---------------------------------------------------------------------- CDR
-
-Encode: TypeAlias = Callable[[Any], bytes]
-Decode: TypeAlias = Callable[[bytes], Any]
 
 Pieces: TypeAlias = "list[Any]"
 WriteItem: TypeAlias = Callable[[Any, Pieces, int], int]
 ReadItem: TypeAlias = Callable[[bytes, int], "tuple[Any, int]"]
 
-_HEADER = b"\0\1\0\0"
-_START = len(_HEADER)
+HEADER = b"\0\1\0\0"
+"""The encapsulation header of plain CDR, little-endian."""
+_START = len(HEADER)
 
 _LENGTH = struct.Struct("<I")
 _LENGTHS = tuple(struct.Struct(f"<{padding}xI") for padding in range(4))
@@ -139,22 +145,8 @@ class Unusual(Exception):
     """A message or its class is left to rclpy."""
 
 
-NOT_OURS = (Unusual, struct.error, AttributeError, TypeError, ValueError, OverflowError)
+_NOT_OURS = (Unusual, struct.error, AttributeError, TypeError, ValueError, OverflowError)
 """Writing raises these for a message that is left to rclpy."""
-
-
-@cache
-def cdr(kind: type) -> tuple[Encode, Decode] | None:
-    """The encoder and decoder of a message class; ``None`` where only rclpy has them.
-
-    The encoder raises one of ``NOT_OURS`` for a message that is left to rclpy, the decoder
-    ``Unusual``, and ``ValueError`` or ``struct.error`` for what is none.
-    """
-    try:
-        parts = _parts_of(kind)
-    except Unusual:
-        return None
-    return _encoder(kind, parts), _decoder(kind, parts)
 
 
 @cache
@@ -244,33 +236,6 @@ def _single(code: str) -> tuple[WriteItem, ReadItem]:
     return write, read
 
 
-def _encoder(kind: type, parts: tuple[Part, ...]) -> Encode:
-    writers = tuple(part.write for part in parts)
-
-    def encode(message: Any) -> bytes:
-        if type(message) is not kind:
-            raise Unusual
-        pieces: Pieces = [_HEADER]
-        at = 0
-        for write in writers:
-            at = write(message, pieces, at)
-        return b"".join(pieces)
-
-    return encode
-
-
-def _decoder(kind: Any, parts: tuple[Part, ...]) -> Decode:
-    read = _reader(kind, parts)
-
-    def decode(data: bytes) -> Any:
-        if data[:_START] != _HEADER:
-            raise Unusual
-        message, _ = read(data, 0)
-        return message
-
-    return decode
-
-
 class Part:
     """Some fields that follow each other: where they are in a message, and their encoding.
 
@@ -295,15 +260,13 @@ class Numbers(Part):
 
     def __init__(self, leaves: Sequence[Leaf]) -> None:
         super().__init__(leaves)
-        if len(leaves) == 1:
-            get = self.get
-            self.get = lambda message: (get(message),)
         codes = [leaf.field.type.code for leaf in leaves]
+        self._has_several = len(codes) > 1
         self._layouts = tuple(_aligned(codes, at) for at in range(8))
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
-        layout = self._layouts[at & 7]
-        pieces.append(layout.pack(*self.get(message)))
+        layout, values = self._layouts[at & 7], self.get(message)
+        pieces.append(layout.pack(*values) if self._has_several else layout.pack(values))
         return at + layout.size
 
     def read(self, data: bytes, at: int, values: list[Any]) -> int:

@@ -21,8 +21,8 @@ from neuros.transport.codecs import message_codec
 from neuros.transport.large_packets import LARGE_BYTES, is_parcel, message_of
 from neuros.transport.message_buffers import MessageBuffers, message_buffers
 
-Digest: TypeAlias = Callable[[Any, bytes], int]
-"""From a packet, and the bytes that it travels as, to its digest."""
+Digest: TypeAlias = Callable[[bytes, Any], int]
+"""From the bytes that a packet travels as, and the packet, to its digest."""
 
 _WARMING_UP, _TRIED = 16, 48
 _DEAR = 0.02
@@ -41,13 +41,8 @@ def digest_for(kind: type) -> Digest:
     """The digest function of a message class."""
     buffers = message_buffers(kind)
     if buffers is None:
-        return digest_of_data
+        return digest_of_bytes
     return _LargeDigest(kind, buffers)
-
-
-def digest_of_data(packet: Any, data: bytes) -> int:
-    """The digest of a packet that is whole in its bytes; of a JPEG, both ends have only those."""
-    return digest_of_bytes(data)
 
 
 def digest_of(packet: Any) -> int:
@@ -111,7 +106,7 @@ class _LargeDigest:
         self._plain = message_codec(kind)
         self._buffers = buffers
 
-    def __call__(self, packet: Any, data: bytes) -> int:
+    def __call__(self, data: bytes, packet: Any) -> int:
         if is_parcel(data):
             return _digest(message_of(data), self._buffers, packet)
         if len(data) < LARGE_BYTES or _size(self._buffers.views(packet)) < LARGE_BYTES:
@@ -120,8 +115,11 @@ class _LargeDigest:
         return _digest(rest, self._buffers, packet)
 
 
-def digest_of_bytes(data: bytes) -> int:
-    """The digest of a whole message, padded to four bytes, as it arrives (RTPS, 9.4.1)."""
+def digest_of_bytes(data: bytes, packet: Any = None) -> int:
+    """The digest of a whole message, padded to four bytes, as it arrives (RTPS, 9.4.1).
+
+    Of a JPEG, both ends have only the bytes; ``packet`` does not count.
+    """
     missing = -len(data) % 4
     return int(xxh3_64_intdigest(data + bytes(missing) if missing else data))
 

@@ -92,14 +92,16 @@ def checked(port: Port, packet: Any) -> Any:
 Copy: TypeAlias = Callable[[Any], Any]
 
 
+def make_packet(type_name: str) -> Any:
+    """A new message of a type in ROS notation, as its class without arguments would make it."""
+    return _factory(message_class(type_name))()
+
+
 class RosPackets:
     """What NeuROS does with ROS messages (:class:`neuros.ports.Packets`)."""
 
-    def message_class(self, type_name: str) -> type:
-        return message_class(type_name)
-
-    def make(self, type_name: str) -> Any:
-        return make_packet(type_name)
+    make = staticmethod(make_packet)
+    message_class = staticmethod(message_class)
 
     def checker(self, kind: type, *, for_jpeg: bool = False) -> Copy:
         if for_jpeg:
@@ -123,11 +125,6 @@ def copy_packet(packet: Any) -> Any:
     """A message that shares nothing with ``packet``, which has been checked."""
     kind: Any = type(packet)
     return _copier(kind)(packet)
-
-
-def make_packet(type_name: str) -> Any:
-    """A new message of a type in ROS notation, as its class without arguments would make it."""
-    return _factory(message_class(type_name))()
 
 
 @cache

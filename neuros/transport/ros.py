@@ -7,11 +7,9 @@ publishes there is named in the log (:class:`neuros.transport.ros_graph.Stranger
 
 from __future__ import annotations
 
-import functools
 import struct
 from array import array
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -29,71 +27,90 @@ from std_msgs.msg import String, UInt64
 
 from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
-from neuros.transport.codecs import Codec, Decoder, Encoder, message_codec
-from neuros.transport.digests import Digest, digest_for, digest_of_data, make_digests
+from neuros.transport.codecs import HEADER, PARCEL_MARK, Codec, Decoder, Encoder, message_codec
+from neuros.transport.digests import Digest, digest_for, digest_of_bytes, make_digests
 from neuros.transport.envelope import Compressor, Traffic, compressing, decompressing
-from neuros.transport.large_packets import LargeCodecs, is_parcel, machine_token
+from neuros.transport.large_packets import LargeCodecs, machine_token
 from neuros.transport.messages import message_class
 from neuros.transport.ros_graph import ExternalTopics, StrangerCheck, data_qos, is_compatible
 from neuros.transport.ros_loop import RosLoop
 
 _ANNOUNCE_S = 0.02
 
-_HEADER = b"\0\1\0\0"
 _POSITION = struct.Struct("<4sQ")
 """A ``std_msgs/msg/UInt64`` in little-endian CDR: the header, and the position."""
 
 
-@dataclass
 class SendingLink:
-    """One connection at its sender.
+    """One connection at its sender: all that its packets and their acknowledgements pass.
 
     Attributes:
+        codec: makes bytes of packets; a better one takes its place when the receiver is known.
+        digests: of the packets sent.
         publish: publishes what the codec makes.
         count_readers: returns the number of all subscriptions to the data topic.
-        digests: of the packets sent.
         carries_message: whether the codec makes the packet as ROS serialises it.
-    """
-
-    publish: Callable[[bytes], None]
-    codec: Encoder
-    digest: Digest
-    count_readers: Callable[[], int]
-    digests: array[int]
-    carries_message: bool
-
-
-class ReceivingLink:
-    """One connection at its receiver.
-
-    Args:
-        deliver: gets each packet.
-        digests: of the packets received.
     """
 
     def __init__(
         self,
+        connection: Connection,
+        inbox: Inbox,
+        codec: Encoder,
+        digest: Digest,
+        digests: array[int],
+        publisher: Publisher,
+    ) -> None:
+        self._connection = connection
+        self._inbox = inbox
+        self.codec = codec
+        self.digest = digest
+        self.digests = digests
+        self.publish: Callable[[bytes], None] = publisher.handle.publish_raw
+        self.count_readers: Callable[[], int] = publisher.get_subscription_count
+        self.carries_message = not connection.is_jpeg
+        self.is_open = True
+
+    def receive_position(self, data: bytes) -> None:
+        """Hand over the position that every taker has reached."""
+        if self.is_open:
+            self._inbox.on_acknowledgement(self._connection, position_of(data))
+
+
+class ReceivingLink:
+    """One connection at its receiver: all that its packets and their acknowledgements pass.
+
+    Args:
+        digests: of the packets received.
+        publisher: of acknowledgements, ``None`` on a connection without.
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        inbox: Inbox,
         codec: Decoder,
         digest: Digest,
-        deliver: Callable[[Any], None],
         digests: array[int],
+        publisher: Publisher | None,
     ) -> None:
+        self._deliver = partial(inbox.on_packet, connection)
         self._decode = codec.decode
         self._digest = digest
-        self._deliver = deliver
-        self._note = digests.append
-        self.publish_position: Callable[[int], None] = _nowhere
+        self._digests = digests
+        self._publish = None if publisher is None else publisher.handle.publish_raw
+        self.is_open = True
 
     def receive(self, data: bytes) -> None:
         """Deliver the packet that was published, unless it was lost on its way."""
-        packet = self._decode(data)
-        if packet is not None:
-            self._note(self._digest(packet, data))
+        if self.is_open and (packet := self._decode(data)) is not None:
+            self._digests.append(self._digest(data, packet))
             self._deliver(packet)
 
     def acknowledge(self, position: int) -> None:
         """Publish the position that every taker has reached."""
-        self.publish_position(position)
+        if self.is_open and self._publish is not None:
+            self._publish(_POSITION.pack(HEADER, position))
 
 
 def _way(connection: Connection, port: Port, traffic: Traffic) -> tuple[type, Codec, Digest]:
@@ -101,22 +118,18 @@ def _way(connection: Connection, port: Port, traffic: Traffic) -> tuple[type, Co
     if connection.is_jpeg:
         from neuros.transport import jpeg  # brings all messages of cameras along
 
-        return jpeg.KIND, jpeg.JpegCodec(connection.quality, traffic), digest_of_data
+        return jpeg.KIND, jpeg.JpegCodec(connection.quality, traffic), digest_of_bytes
     kind = message_class(port.type)
     return kind, message_codec(kind), digest_for(kind)
 
 
 def position_of(data: bytes) -> int:
     """The position in an acknowledgement. Raises ``WrongBytes``."""
-    if len(data) == _POSITION.size and data[:4] == _HEADER:
+    if len(data) == _POSITION.size and data[:4] == HEADER:
         position: int = _POSITION.unpack(data)[1]
     else:  # the byte order of another machine
         position = message_codec(UInt64).decode(data).data
     return position
-
-
-def _nowhere(position: int) -> None:
-    """Acknowledges on a connection without acknowledgements."""
 
 
 _LATCHED = QoSProfile(
@@ -145,6 +158,7 @@ class RosTransport:
         self._connections = file.connections
         self._ros_node = ros_node
         self._loop = loop
+        self.note_execution = loop.note_execution
         self._sending: dict[Connection, SendingLink] = {}
         self._receiving: dict[Connection, ReceivingLink] = {}
         self._external = ExternalTopics(file, ros_node, loop)
@@ -187,8 +201,8 @@ class RosTransport:
                 found = encoded.get(link.codec)
                 if found is None:
                     data = link.codec.encode(packet)
-                    found = encoded[link.codec] = (data, link.digest(packet, data))
-                    if link.carries_message and not is_parcel(data):
+                    found = encoded[link.codec] = (data, link.digest(data, packet))
+                    if link.carries_message and data[2:4] != PARCEL_MARK:
                         whole = data
                 link.publish(found[0])
                 link.digests.append(found[1])
@@ -202,20 +216,11 @@ class RosTransport:
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
         """Return what publishes the position that every taker has reached."""
-        acknowledge = self._receiving[connection].acknowledge
-
-        def acknowledge_if_open(position: int) -> None:
-            if self._is_open:
-                acknowledge(position)
-
-        return acknowledge_if_open
+        return self._receiving[connection].acknowledge
 
     @property
     def compressed(self) -> Mapping[str, tuple[int, int]]:
         return {name: (each.bytes, each.compressed_bytes) for name, each in self._traffic.items()}
-
-    def note_execution(self) -> None:
-        self._loop.note_execution()
 
     def give_way(self) -> None:
         """No other node is in this process."""
@@ -229,6 +234,12 @@ class RosTransport:
     def close(self) -> None:
         """Publish and receive nothing any more; the endpoints go with their ROS node."""
         self._is_open = False
+        links: list[SendingLink | ReceivingLink] = [
+            *self._sending.values(),
+            *self._receiving.values(),
+        ]
+        for link in links:
+            link.is_open = False
         self._strangers.close()
         self._external.close()
         self._large.close()
@@ -243,22 +254,13 @@ class RosTransport:
         data = self._ros_node.create_publisher(
             kind, f"{connection.topic}/data", data_qos(connection)
         )
-        self._sending[connection] = SendingLink(
-            data.handle.publish_raw,
-            codec,
-            digest,
-            data.get_subscription_count,
-            self.digests[connection],
-            carries_message=not connection.is_jpeg,
+        link = self._sending[connection] = SendingLink(
+            connection, inbox, codec, digest, self.digests[connection], data
         )
         subscriptions = []
         if connection.is_reliable:
-
-            def receive_position(data: bytes) -> None:
-                inbox.on_acknowledgement(connection, position_of(data))
-
             subscriptions.append(
-                self._subscribe(UInt64, connection, "ack", _HEARD, receive_position)
+                self._subscribe(UInt64, connection, "ack", _HEARD, link.receive_position)
             )
         self._registrations.append(
             Registration(
@@ -277,20 +279,19 @@ class RosTransport:
     def _open_receiver(self, connection: Connection, inbox: Inbox) -> None:
         port = self._node.input(connection.destination_input)
         kind, codec, digest = _way(connection, port, Traffic())
-        link = self._receiving[connection] = ReceivingLink(
-            codec if connection.is_jpeg else self._large.decoder(connection),
-            digest,
-            partial(inbox.on_packet, connection),
-            self.digests[connection],
-        )
         publishers = []
         if connection.is_reliable:
-            acknowledge = self._ros_node.create_publisher(
-                UInt64, f"{connection.topic}/ack", _LATCHED
+            publishers.append(
+                self._ros_node.create_publisher(UInt64, f"{connection.topic}/ack", _LATCHED)
             )
-            publish = acknowledge.handle.publish_raw
-            link.publish_position = lambda position: publish(_POSITION.pack(_HEADER, position))
-            publishers.append(acknowledge)
+        link = self._receiving[connection] = ReceivingLink(
+            connection,
+            inbox,
+            codec if connection.is_jpeg else self._large.decoder(connection),
+            digest,
+            self.digests[connection],
+            publishers[0] if publishers else None,
+        )
         receive = decompressing(link.receive) if connection.is_zstd else link.receive
         data = self._subscribe(
             kind, connection, "data", data_qos(connection, is_reader=True), receive
@@ -332,19 +333,13 @@ class RosTransport:
         qos: QoSProfile,
         deliver: Callable[[bytes], None],
     ) -> Subscription:
-        """Subscribe to serialised messages until the transport closes."""
+        """Subscribe to serialised messages."""
         topic = f"{connection.topic}/{part}"
         writer = connection.source_node if part == "data" else connection.destination_node
-
-        @functools.wraps(deliver)  # rclpy asks for its signature
-        def receive(data: bytes) -> None:
-            if self._is_open:
-                deliver(data)
-
         return self._ros_node.create_subscription(
             kind,
             topic,
-            self._loop.guarded(receive),
+            self._loop.guarded(deliver),
             qos,
             event_callbacks=self._strangers.callbacks(connection, topic, writer),
             raw=True,

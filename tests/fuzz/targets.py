@@ -47,7 +47,7 @@ from neuros.project.model import Folders
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
 from neuros.recording.recorder import Recorder
 from neuros.replay.recorded_node import RecordedNode, recorded_node
-from neuros.transport.codecs import WrongBytes, cdr, message_codec
+from neuros.transport.codecs import WrongBytes, message_codec
 from neuros.transport.large_packets import LargeInput, LargeOutput
 from neuros.transport.message_buffers import message_buffers
 from neuros.transport.ros import data_qos, position_of
@@ -639,10 +639,8 @@ def packet(data: bytes, _: Path) -> None:
     kind = classes()[place % len(classes())]
     codec = message_codec(kind)
     with allowed(WrongBytes):
-        message = codec.decode(HEADERS[header % len(HEADERS)] + data[3:])
-        again = codec.encode(message)
+        again = codec.encode(codec.decode(HEADERS[header % len(HEADERS)] + data[3:]))
         assert codec.encode(codec.decode(again)) == again
-        assert cdr(kind) is not None or message is not None
 
 
 @cache

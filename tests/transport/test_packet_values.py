@@ -90,7 +90,7 @@ class TestEveryMessageClass:
             for way, carry in WAYS.items():
                 assert parts(carry(packet)) == parts(expected), way
             assert checked(packet) is packet
-            assert digest_of(packet) == digest_for(kind)(packet, message_codec(kind).encode(packet))
+            assert digest_of(packet) == digest_for(kind)(message_codec(kind).encode(packet), packet)
 
         check()
 
