@@ -12,25 +12,22 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol
 
-import rclpy.task
 from rclpy.context import Context
 from rclpy.executors import ConditionReachedException, SingleThreadedExecutor, TimeoutException
 from rclpy.logging import get_logger
 from rclpy.node import Node as RosNode
 
 from neuros.errors import EnvironmentFault
+from neuros.transport.rclpy_patches import OnFailure, own_tasks
 
 EXECUTOR_VARIABLE = "NEUROS_EXECUTOR"
 """``events`` or ``wait_set``; unset, the first that works."""
 
 _SERVICE_DEPTH = 10
-
-OnFailure: TypeAlias = Callable[[BaseException], None]
 
 
 class Waker(Protocol):
@@ -52,85 +49,6 @@ class Executor(Protocol):
         """Serve events until the time is over, or the waker calls what was registered with it."""
 
     def shutdown(self, timeout_sec: float) -> object: ...
-
-
-class Turn:
-    """A callback that can stand in the queue of an executor again and again.
-
-    ``create_task`` of rclpy makes a task for each call, an object with two locks and a weak
-    reference, for 4 of the 6.5 us that a turn in the queue takes. This one takes the place of such
-    a task itself, and has always been done. Where rclpy wraps it after all, that works, too.
-    """
-
-    __slots__ = ("_callback",)
-
-    def __init__(self, callback: Callable[[], None]) -> None:
-        self._callback = callback
-
-    def __call__(self) -> None:
-        self._callback()
-
-    def done(self) -> bool:
-        """The queue may forget it."""
-        return True
-
-    def exception(self) -> None:
-        """The callback raises none."""
-
-
-class GuardedTask(rclpy.task.Task):  # type: ignore[misc]
-    """A task of rclpy that fails without the executor, which would end the process by SIGSEGV.
-
-    If it is a coroutine, it goes on as soon as the future that it waits for is done. The executor
-    looks at coroutines only after callbacks of ROS, so one whose future was set by a hook or by
-    another task waited for ever if nothing of ROS followed: for the result of an action, where that
-    came in one go with the feedback.
-    """
-
-    on_failure: OnFailure
-    _is_hidden = False
-    _awaited: rclpy.task.Future | None = None
-
-    def __call__(self) -> None:
-        self._go_on()
-        self._is_hidden = self._exception is not None  # whoever calls, the executor, asks next
-
-    def _go_on(self) -> None:
-        if not self._pending():
-            return
-        super().__call__()
-        if not self._pending():
-            if self._exception is not None:
-                self.on_failure(self._exception)
-            return
-        awaited = _awaited_by(self._handler)
-        if awaited is not None and awaited is not self._awaited:
-            awaited.add_done_callback(self._post)
-        self._awaited = awaited
-
-    def _post(self, _: object) -> None:
-        executor = self._executor()
-        if executor is not None:
-            executor.create_task(Turn(self._go_on))
-
-    def exception(self) -> BaseException | None:
-        """The error of the task; ``None`` for the executor, which asks first."""
-        if self._is_hidden:
-            self._is_hidden = False
-            return None
-        found: BaseException | None = super().exception()
-        return found
-
-
-def _awaited_by(coroutine: Any) -> rclpy.task.Future | None:
-    """The future of ROS that a coroutine waits for, if it can be seen."""
-    found = inner = coroutine
-    while inner is not None:
-        found, inner = inner, getattr(inner, "cr_await", getattr(inner, "gi_yieldfrom", None))
-    if getattr(found, "gi_code", None) is not rclpy.task.Future.__await__.__code__:
-        return None
-    future: rclpy.task.Future = found.gi_frame.f_locals["self"]
-    return future
 
 
 def make_executor(context: Context, on_failure: OnFailure) -> Executor:
@@ -162,34 +80,12 @@ def make_executor(context: Context, on_failure: OnFailure) -> Executor:
 def _events_executor(context: Context, on_failure: OnFailure) -> Executor:
     from rclpy.experimental.events_executor import EventsExecutor  # may have gone
 
-    with _own_tasks(on_failure):
+    with own_tasks(on_failure):
         executor = EventsExecutor(context=context)
     for name in ("add_node", "create_task", "spin_until_future_complete", "shutdown"):
         getattr(executor, name)
     found: Executor = executor
     return found
-
-
-@contextmanager
-def _own_tasks(on_failure: OnFailure) -> Iterator[None]:
-    """Let an executor that is made now take a :class:`Turn` for a task, and guard all others.
-
-    It looks up the class of tasks once, when it is made, and there is no other way to tell it.
-    """
-    task = rclpy.task.Task
-
-    def make_task(handler: Any, *arguments: Any, **keywords: Any) -> Any:
-        if type(handler) is Turn:
-            return handler
-        made = GuardedTask(handler, *arguments, **keywords)
-        made.on_failure = on_failure
-        return made
-
-    rclpy.task.Task = make_task
-    try:
-        yield
-    finally:
-        rclpy.task.Task = task
 
 
 class WaitSetExecutor:

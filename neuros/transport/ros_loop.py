@@ -30,7 +30,8 @@ from rclpy.context import Context
 from rclpy.node import Node as RosNode
 from rclpy.timer import Timer
 
-from neuros.transport.executors import Turn, WaitSetExecutor, make_executor
+from neuros.transport.executors import WaitSetExecutor, make_executor
+from neuros.transport.rclpy_patches import Turn
 
 Event = Callable[[], None]
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -39,6 +37,7 @@ from neuros.transport.lean_node import (
 )
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import RosPackets
+from neuros.transport.rclpy_patches import do_without_code_generator
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
@@ -298,7 +297,7 @@ class _Rclpy(TransportKind):
         record: bool,
         debug: bool,
     ) -> RosProcess:
-        _do_without_code_generator()
+        do_without_code_generator()
         return RosProcess(
             files,
             on_failure,
@@ -307,22 +306,6 @@ class _Rclpy(TransportKind):
             record=record,
             debug=debug,
         )
-
-
-def _do_without_code_generator() -> None:
-    """Import ``rosidl_generator_py``, which messages need, without ``generate_py`` in it.
-
-    It goes without where that cannot be imported. A node does not need it, and what it imports in
-    turn (a parser) would take a node a seventh of the time of all imports.
-    """
-    generator = "rosidl_generator_py.generate_py_impl"
-    if generator in sys.modules:
-        return
-    sys.modules[generator] = None  # type: ignore[assignment]
-    try:
-        importlib.import_module("rosidl_generator_py")
-    finally:
-        del sys.modules[generator]
 
 
 ROS = _Rclpy("ros", in_memory=False)

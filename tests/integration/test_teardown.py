@@ -20,9 +20,10 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from neuros.backends.domain import choose_domain
-from neuros.transport import lean_node
-from neuros.transport.lean_node import end_discovery, give_up
+from neuros.transport import rclpy_patches
+from neuros.transport.lean_node import give_up
 from neuros.transport.messages import message_class
+from neuros.transport.rclpy_patches import end_discovery
 
 String = message_class("std_msgs/msg/String")
 TOPICS = [f"topic_{place}" for place in range(5)]
@@ -72,7 +73,7 @@ def test_a_participant_without_discovery_hears_of_nobody_any_more(
 
 
 def test_another_rmw_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lean_node, "_RMW", "librmw_other.so")
+    monkeypatch.setattr(rclpy_patches, "_RMW", "librmw_other.so")
     with choose_domain(None, {}, False) as domain:
         context, node = begin("node", domain.id)
         give_up(context, [node])
