@@ -14,6 +14,7 @@ import functools
 import inspect
 import threading
 import types
+from collections import deque
 from collections.abc import Callable, Coroutine, Generator, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -24,6 +25,7 @@ from rclpy.exceptions import ParameterNotDeclaredException as ParameterNotDeclar
 from rclpy.node import Node as RosNode
 from rclpy.parameter import Parameter as Parameter
 from rclpy.parameter_service import ParameterService
+from rclpy.subscription import Subscription
 
 from neuros.errors import NO_WAITING, NodeError
 from neuros.project.model import NodeFile, Value
@@ -39,7 +41,7 @@ _OF_ROS = "use_sim_time"  # rclpy declares it itself
 Fail: TypeAlias = Callable[[Any, BaseException], None]
 
 # Methods that take a callback, and its place among their arguments.
-_CREATORS = (("create_timer", 1), ("create_subscription", 2), ("create_service", 2))
+_CREATORS = (("create_timer", 1), ("create_service", 2))
 
 
 class LeanNode(RosNode):  # type: ignore[misc]
@@ -152,6 +154,7 @@ class PluginCallbacks:
         self._thread = threading.get_ident()  # in which the loop runs hooks and callbacks
         for name, place in _CREATORS:
             setattr(ros_node, name, self._creating(getattr(ros_node, name), name, place))
+        ros_node.create_subscription = self._subscribing(ros_node.create_subscription)
         ros_node.create_client = self._creating_client(ros_node.create_client)
         ros_node.add_waitable = self._adding(ros_node.add_waitable)
         if loop.is_limited:
@@ -205,6 +208,20 @@ class PluginCallbacks:
             return made
 
         return creating
+
+    def _subscribing(self, create: Callable[..., Subscription]) -> Any:
+        @functools.wraps(create)
+        def subscribing(
+            msg_type: Any, topic: str, callback: Any, qos_profile: Any, *rest: Any, **keywords: Any
+        ) -> Subscription:
+            self._loop.expect_arrivals()
+            wrapped = self.wrapped(callback)
+            if callable(callback) and not inspect.iscoroutinefunction(callback):
+                depth = qos_profile if isinstance(qos_profile, int) else qos_profile.depth
+                wrapped = _rationed(wrapped, self._loop, depth)
+            return create(msg_type, topic, wrapped, qos_profile, *rest, **keywords)
+
+        return subscribing
 
     def _answering(self, send_response: Callable[..., None]) -> Any:
         """A service does not answer after a failure."""
@@ -307,6 +324,42 @@ class _EnteringSteps(Generator[Any, Any, Any]):
     def throw(self, *error: Any) -> Any:
         """Raise in the coroutine; so does closing it."""
         return self.cr_await.throw(*error)
+
+
+def _rationed(callback: Callable[..., Any], loop: RosLoop, depth: int) -> Callable[..., Any]:
+    """A callback of a subscription, called for at most ``depth`` messages in one turn of the loop.
+
+    rclpy queues an event for each message, and each event takes the newest there is. So with a
+    callback that takes longer than there is between two messages, twice as many would come before
+    each hook as before the last one. What comes beyond ``depth`` waits for the next turn, and takes
+    the place of what is older, as it would in DDS. A depth of 0 (KEEP_ALL) drops nothing.
+    """
+    waiting: deque[tuple[Any, ...]] = deque(maxlen=depth or None)
+    turn, left = -1, 0
+
+    def may_call() -> bool:
+        nonlocal turn, left
+        if turn != loop.turns:
+            turn, left = loop.turns, max(depth, 1)
+        left -= 1
+        return left >= 0
+
+    def catch_up() -> None:
+        while waiting and may_call():
+            callback(*waiting.popleft())
+        if waiting:
+            loop.post(catch_up)
+
+    @functools.wraps(callback)  # rclpy asks for its signature
+    def receive(*message: Any) -> None:
+        if not waiting and may_call():
+            callback(*message)
+            return
+        if not waiting:
+            loop.post(catch_up)
+        waiting.append(message)
+
+    return receive
 
 
 def _refuse_guard_condition(*_: Any, **__: Any) -> Any:

@@ -73,6 +73,7 @@ class RosLoop:
 
     Attributes:
         has_taken_in: whether all that ROS had waiting when a hook or callback ended is handled.
+        turns: how many turns the events of engines have had.
     """
 
     def __init__(self, context: Context, on_failure: Callable[[BaseException], None]) -> None:
@@ -85,6 +86,7 @@ class RosLoop:
         self._is_turn_stale = False
         self.has_taken_in = True
         self._has_arrivals = False
+        self.turns = 0
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._planned_ns: int | None = None
         self._has_older_events = False
@@ -234,6 +236,7 @@ class RosLoop:
             self._post_turn()
             return
         self.has_taken_in = True
+        self.turns += 1
         events = self._events
         begin_ns = since_ns = now_ns = time.monotonic_ns()
         if begin_ns - self._looked_ns > _LOOK_NS:
