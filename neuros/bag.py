@@ -28,7 +28,14 @@ from neuros.errors import EnvironmentFault
 from neuros.recording.columns import LOG_TIME, PUBLISH_TIME, Column, columns_of
 from neuros.recording.recorder import lost_of, named, needs_repair, recorded_counts, repair
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
-from neuros.recording.stored import StoredTopics, are_left, damage_of, faults_of, opened, store_of
+from neuros.recording.stored import (
+    are_left,
+    contents_of,
+    damage_of,
+    faults_of,
+    store_of,
+    stored_messages,
+)
 from neuros.registry import BAG_FORMATS
 
 __all__ = ["Bag", "RawPacket", "RecordedTopic", "open"]
@@ -175,16 +182,16 @@ class Bag:
         recorded: Mapping[str, int] | None = None,
     ) -> None:
         self.folder = folder
-        with opened(folder) as reader, damage_of(folder):
-            self.custom: dict[str, str] = dict(reader.storage.metadata.custom or {})
-            self.start_ns, self.duration_s = reader.start_time, reader.duration / 1e9
-            found = {c.topic: c for c in reader.connections}
+        contents = contents_of(folder)
+        with damage_of(folder):
+            self.custom = contents.custom
+            self.start_ns, self.duration_s = contents.start_ns, contents.duration_ns / 1e9
+            found = {c.topic: c for c in contents.connections}
             self.store = store_of(found.values())
             self.topics = {
                 name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
             }
         self.missing = lost_of(recorded or {}, {name: t.count for name, t in self.topics.items()})
-        self._stored = StoredTopics(folder, self.refuse)
         self._packets: dict[str, list[RawPacket]] = {}
 
     @property
@@ -245,7 +252,9 @@ class Bag:
         if name not in self._packets:
             packets = [
                 RawPacket(log_ns, publish_ns, data)
-                for _, log_ns, publish_ns, data, _ in self._stored.messages(name)
+                for _, log_ns, publish_ns, data, _ in stored_messages(
+                    self.folder, self.refuse, name
+                )
             ]
             self.expect(name, len(packets))
             packets.sort(key=itemgetter(0))
@@ -284,21 +293,19 @@ def open(run: str | os.PathLike[str]) -> Bag:
 def open_bag(run: str | os.PathLike[str]) -> Bag:
     """Open the bag of a run, as :func:`open`, but without a warning."""
     folder = Path(run)
-    if (folder / "metadata.yaml").is_file() and not (folder / PLAN_NAME).is_file():
-        if not (folder.parent / PLAN_NAME).is_file():
+    if not (folder / PLAN_NAME).is_file():
+        if folder.name == BAG_NAME and (folder.parent / PLAN_NAME).is_file():
+            folder = folder.parent
+        elif (folder / "metadata.yaml").is_file():
             return Bag(folder, {})
-        folder = folder.parent
     plan, recorded = load_plan(folder), recorded_counts(folder)
     if needs_repair(folder, plan):
-        _repair_if_possible(folder)
+        try:
+            repair(folder, lambda _: None)
+        except EnvironmentFault:  # the run still goes on, or there is no room
+            if not (folder / BAG_NAME).is_dir():
+                raise
     connections = {topic.name: topic.connection for topic in plan.topics}
-    return Bag(folder / BAG_NAME, connections, recorded)
-
-
-def _repair_if_possible(run: Path) -> None:
-    """A run that still goes on has a bag that can be read as it is."""
-    try:
-        repair(run, lambda _: None)
-    except EnvironmentFault:
-        if not (run / BAG_NAME / "metadata.yaml").is_file():
-            raise
+    bag = Bag(folder / BAG_NAME, connections, recorded)
+    bag.custom = bag.custom or dict(plan.custom)  # metadata are written at the end
+    return bag

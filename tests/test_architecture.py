@@ -116,7 +116,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "cli.live": {"tabulate"},
     "cli.runs": {"tabulate"},
     "replay.replayed_node": {"debugpy"},
-    "recording": {"rosbags", "psutil", "tabulate", "numpy", "xxhash"},
+    "recording": {"mcap", "rosbags", "psutil", "tabulate", "numpy", "xxhash"},
     "visualise": {"numpy"},
     "visualise.program": {"matplotlib", "numpy"},
     "recording.columns": {"rosbags", "numpy"},

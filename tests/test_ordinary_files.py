@@ -19,7 +19,7 @@ from neuros.ordinary_files import (
     open_ordinary,
     write_whole,
 )
-from neuros.recording.bag_files import BagWriter
+from neuros.recording.bag_writer import BagWriter
 from neuros.recording.recorder import counts_of
 from neuros.recording.recording_plan import Stream, Topic
 from neuros.recording.run_file import write_run_file
@@ -206,11 +206,10 @@ def test_a_node_cannot_have_packets_kept_in_another_folder(
 
 
 def test_a_node_cannot_have_the_bag_written_elsewhere(run: Path, elsewhere: Path) -> None:
-    bag = BagWriter(run / "bag", "mcap", {})
+    bag = BagWriter(run / "bag", {})
     linked(run / "bag", elsewhere)
     with pytest.raises(NotADirectoryError, match="bag"):
-        bag.checkpoint()
-    bag.shut()
+        bag.close()
     assert is_as_it_was(elsewhere)
 
 

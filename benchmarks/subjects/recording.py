@@ -122,7 +122,7 @@ def live(size: int, seconds: float) -> dict[str, float]:
     count = round(LIVE_RATE * seconds / len(names))
     topics = tuple(Topic(f"/neuros/{n}/out/z/{n}/data", "std_msgs/msg/String") for n in names)
     streams = {name: (Stream("sent", "out", (place,)),) for place, name in enumerate(names)}
-    plan = RecordingPlan("mcap", topics, streams)
+    plan = RecordingPlan(topics, streams)
     with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
         run = Path(folder)
         plan.save(run)
@@ -149,7 +149,7 @@ def live(size: int, seconds: float) -> dict[str, float]:
 def recorded(size: int, count: int) -> dict[str, float]:
     """Keep packets of a size, and move them into a bag: a node's side, and the recorder's."""
     topic = Topic("/neuros/a/out/b/in/data", "std_msgs/msg/String")
-    plan = RecordingPlan("mcap", (topic,), {"a": (Stream("sent", "out", (0,)),)})
+    plan = RecordingPlan((topic,), {"a": (Stream("sent", "out", (0,)),)})
     data = bytes(size)
     with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
         run = Path(folder)

@@ -223,12 +223,15 @@ class Request(ProjectOptions):
         group=_RECORDING,
         help="do not record this topic",
     )
-    storage: str = option(
-        "--storage",
-        choices=("mcap", "sqlite3"),
-        default="mcap",
+    flush_interval: float = option(
+        "--flush-interval",
+        parse=positive_seconds,
+        default=1.0,
+        metavar="SECONDS",
         group=_RECORDING,
-        help="write the bag in this format",
+        page="recording.md#what-to-record",
+        help="bring packets to the disk in this interval; a power failure loses those since the"
+        " last one",
     )
     progress: bool | None = option(
         "--progress",
@@ -281,13 +284,12 @@ class Request(ProjectOptions):
         named = () if isinstance(self.record, bool) else self.record
         topics = (*((named,) if isinstance(named, str) else named), *self.topics)
         if not (everything or topics):
-            if self.exclude or self.storage != "mcap":
-                name = "--exclude" if self.exclude else "--storage"
-                raise UsageError(f"{name}: nothing is recorded; add -r, or name topics with -t")
+            if self.exclude:
+                raise UsageError("--exclude: nothing is recorded; add -r, or name topics with -t")
             return None
         from neuros.recording.recording_plan import Request as RecordingRequest
 
-        return RecordingRequest(everything, topics, tuple(self.exclude), self.storage)
+        return RecordingRequest(everything, topics, tuple(self.exclude), self.flush_interval)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -182,7 +182,7 @@ class Recording:
             )
         record["recording"] = {
             "bag": str(self._run / BAG_NAME),
-            "storage": self._plan.storage,
+            "storage": "mcap",
             "topics": topics,
             "problems": problems,
         }
@@ -209,13 +209,11 @@ def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None
     """What is recorded of a run, ``None``: nothing.
 
     Raises:
-        UsageError: if something is to be recorded that is not there, or not in that folder.
+        UsageError: if something is to be recorded that is not there.
     """
     wanted = plan.request.recording
     if wanted is None:
         return None
-    run = run_folder_path(plan.request.output, plan.project.name)
-    _check_folder(wanted.storage, run)
     is_open = plan.needs_known_domain or plan.request.domain_id is not None
     return plan_recording(
         plan.project,
@@ -224,16 +222,6 @@ def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None
         is_alone=not is_open and "ROS_DOMAIN_ID" not in environ,
         custom=_custom_data(plan.project),
     )
-
-
-def _check_folder(storage: str, run: Path) -> None:
-    """Raise ``UsageError`` where the bag would be written elsewhere: SQLite is given an address."""
-    odd = [character for character in "#?%" if character in str(run)]
-    if storage == "sqlite3" and odd:
-        raise UsageError(
-            f"--storage sqlite3 cannot write to {run}, which has {' and '.join(odd)} in its name:"
-            " name another folder with -o, or record as mcap"
-        )
 
 
 def log_of(run: Path) -> Path:

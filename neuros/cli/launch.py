@@ -181,7 +181,7 @@ def _dry_run(plan: Plan) -> int:
         print(line)
     if recording is not None:
         names = ", ".join([*(topic.name for topic in recording.topics), *recording.listen])
-        print(f"recorder: {names or 'nothing'} ({recording.storage})")
+        print(f"recorder: {names or 'nothing'}")
     return 0
 
 

@@ -21,7 +21,7 @@ from neuros.cli import EXIT_CODES
 from neuros.cli.terminal import harmless_output
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
-from neuros.options import positive_number
+from neuros.options import positive_number, positive_seconds
 from neuros.ordinary_files import cannot_be_opened
 from neuros.ports import Subcommand
 from neuros.project.suggest import counted, did_you_mean, listed
@@ -75,6 +75,7 @@ _WANTED: dict[Any, str] = {
     int: "a whole number",
     float: "a number",
     positive_number: "a whole number from 1 on",
+    positive_seconds: "a number above 0",
 }
 
 

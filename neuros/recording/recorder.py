@@ -20,7 +20,7 @@ from typing import TypeAlias
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ordinary_files import open_ordinary, reason_of
 from neuros.project.scanner import read_bytes
-from neuros.recording.bag_files import BagWriter
+from neuros.recording.bag_writer import BagWriter
 from neuros.recording.recording_plan import (
     BAG_NAME,
     LISTENER,
@@ -38,17 +38,12 @@ from neuros.recording.spool import (
     forget_listened,
     listened_topics,
 )
-from neuros.recording.stored import Stored, faults_of, is_whole, opened, stored_messages
+from neuros.recording.stored import Stored, contents_of, faults_of, is_whole, stored_messages
 
 # A packet is in its spool this long after its time at the latest, unless its process was kept from
 # running. Readers of bags sort, so a packet that comes later is only less convenient.
 _SETTLED_NS = 20_000_000
 _MOST_BYTES = 8 << 20
-_CHECKPOINT_S = 1.0
-_CHECKPOINT_BYTES = 16 << 20
-# A checkpoint writes about every topic and every megabyte, so it takes longer as they become more;
-# the pause after it is this many times as long, for a recorder must not take the nodes' time.
-_CHECKPOINT_PAUSE = 50
 _ALL_NS = (1 << 63) - 1
 
 _Kept: TypeAlias = "tuple[int, int, tuple[int, ...], bytes, bool]"
@@ -64,7 +59,7 @@ class Recorder:
         run: the run folder.
         complain: is told of each problem, in a sentence.
         is_new: asked with the number of a topic and a wall time whether the bag lacks that packet.
-        clock: monotonic, in seconds: when a checkpoint is due.
+        clock: monotonic, in seconds: when a flush is due.
 
     Raises:
         OSError: if the bag cannot be made.
@@ -83,7 +78,7 @@ class Recorder:
         self._complain = complain
         self._is_new = is_new
         self._clock = clock
-        self.bag = BagWriter(run / BAG_NAME, plan.storage, plan.custom)
+        self.bag = BagWriter(run / BAG_NAME, plan.custom)
         self.topics: dict[Topic, int | None] = {}
         for topic in plan.topics:
             self.number_of(topic)
@@ -103,9 +98,8 @@ class Recorder:
         self._held: list[_Kept] = []
         self._wall_clock = ForwardClock()
         self._sim_ns = 0
-        self.bag.checkpoint()
-        self._due_s = self._clock() + _CHECKPOINT_S
-        self._written = self._checked = 0
+        self._is_flushed = True
+        self._due_s = self._clock() + plan.flush_interval
 
     def number_of(self, topic: Topic) -> int | None:
         """The number of a topic in the bag, ``None`` if it cannot be recorded."""
@@ -120,11 +114,15 @@ class Recorder:
     def poll(self) -> bool:
         """Move what there is; returns whether there is more right now. Raises ``OSError``."""
         has_more = self._move(self._wall_clock() - _SETTLED_NS)
-        is_due = self._clock() >= self._due_s
-        if self._written > self._checked and (
-            is_due or self.bag.pending_bytes >= _CHECKPOINT_BYTES
-        ):
-            self._checkpoint()
+        if not self._is_flushed and self._clock() >= self._due_s:
+            self._due_s = self._clock() + self._plan.flush_interval
+            self.bag.flush()
+            self._is_flushed = True
+            # Whatever was read and is not held is in the bag.
+            safe_ns = self._held[0][0] - 1 if self._held else _ALL_NS
+            for source in self._sources:
+                if not source.is_damaged:
+                    source.reader.remove_up_to(safe_ns)
         return has_more
 
     @property
@@ -138,13 +136,12 @@ class Recorder:
         number = self.number_of(topic)
         if number is not None:
             self.bag.put(number, message.log_ns, message.publish_ns, message.data)
-            self._write_out()
         return number
 
     def complete(self) -> None:
         """Move all that is left, and close the bag. Raises ``OSError``."""
         while self._move(None):
-            self._write_out()
+            pass
         self.bag.close()
 
     def clean_up(self) -> None:
@@ -192,7 +189,7 @@ class Recorder:
             self._write(*kept)
             written += 1
         del self._held[:written]
-        self._written += written
+        self._is_flushed = self._is_flushed and not written
         return has_more
 
     def _read(self, source: _SpoolSource) -> tuple[list[Record], bool]:
@@ -241,23 +238,6 @@ class Recorder:
         for topic in topics:
             if self._is_new is None or self._is_new(topic, wall_ns):
                 self.bag.put(topic, wall_ns, publish_ns, data)
-
-    def _write_out(self) -> None:
-        """Bags may be larger than memory."""
-        if self.bag.pending_bytes >= _CHECKPOINT_BYTES:
-            self.bag.checkpoint()
-
-    def _checkpoint(self) -> None:
-        began_s = self._clock()
-        self.bag.checkpoint()
-        took_s = self._clock() - began_s
-        self._due_s = began_s + took_s + max(_CHECKPOINT_S, _CHECKPOINT_PAUSE * took_s)
-        self._checked = self._written
-        # Whatever was read and is not held is in the bag.
-        safe_ns = self._held[0][0] - 1 if self._held else _ALL_NS
-        for source in self._sources:
-            if not source.is_damaged:
-                source.reader.remove_up_to(safe_ns)
 
     def _numbers(self, topics: Iterable[Topic]) -> tuple[int, ...]:
         numbers = (self.number_of(topic) for topic in topics)
@@ -372,8 +352,7 @@ def named(lost: Mapping[str, int]) -> str:
 def counts_of(run: Path) -> dict[str, int]:
     """Packets in the bag of a run, by topic. Raises ``OSError`` if it cannot be read."""
     try:
-        with opened(run / BAG_NAME) as reader:
-            return {connection.topic: connection.msgcount for connection in reader.connections}
+        return {each.topic: each.msgcount for each in contents_of(run / BAG_NAME).connections}
     except EnvironmentFault as error:
         raise OSError(errno.EIO, str(error)) from error
 
@@ -407,7 +386,7 @@ def _rebuild(
 
     recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
     try:
-        for message in stored_messages(damaged, note):
+        for message in stored_messages(damaged, note) if damaged.exists() else ():
             if message.may_have_changed:
                 changed += 1
                 if not keeps_changed:
@@ -419,6 +398,9 @@ def _rebuild(
         recorder.complete()
     except BaseException:
         recorder.abandon()
+        if damaged.exists():
+            shutil.rmtree(bag)
+            damaged.rename(bag)
         raise
     counts = recorder.counts()
     lost = lost_of(recorded, counts)

@@ -71,15 +71,16 @@ class RecordingPlan:
         wanted: those of them that were asked for by name.
         time_owner: the one node that owns simulated time; ``None`` if none or several do.
         custom: for the metadata of the bag.
+        flush_interval: seconds after which packets are on the disk.
     """
 
-    storage: str
     topics: tuple[Topic, ...]
     streams: Mapping[str, tuple[Stream, ...]]
     listen: tuple[str, ...] = ()
     wanted: tuple[str, ...] = ()
     time_owner: str | None = None
     custom: Mapping[str, str] = field(default_factory=dict)
+    flush_interval: float = 1.0
 
     def save(self, run: Path) -> None:
         """Write it into the run folder. Raises ``OSError``."""
@@ -102,6 +103,7 @@ def load_plan(run: Path) -> RecordingPlan:
             raise UsageError(
                 f"{path} is of version {version}, and this NeuROS reads version {_VERSION}"
             )
+        content.pop("storage", None)  # of plans when there was a choice
         plan = read_as(RecordingPlan, content)
         places = {place for each in plan.streams.values() for s in each for place in s.topics}
         if not places <= {*range(len(plan.topics))} or not all(
@@ -131,19 +133,19 @@ def _why_no_plan(run: Path) -> str:
 
 @dataclass(frozen=True)
 class Request:
-    """Topics to record, and the storage.
+    """Topics to record.
 
     Attributes:
         everything: all that the project's nodes send and hear, and ``/clock``.
         topics: names and patterns of topics, connections or outputs; besides everything, or alone.
         exclude: names and patterns that are left out in any case.
-        storage: ``mcap`` or ``sqlite3``.
+        flush_interval: seconds after which packets are on the disk.
     """
 
     everything: bool
     topics: tuple[str, ...] = ()
     exclude: tuple[str, ...] = ()
-    storage: str = "mcap"
+    flush_interval: float = 1.0
 
 
 class _Candidate(NamedTuple):
@@ -183,7 +185,6 @@ def plan_recording(
     topics = list(dict.fromkeys(each.topic for each in chosen))
     owners = [n.name for n in project.nodes if n.name in names and n.owns_time]
     return RecordingPlan(
-        storage=request.storage,
         topics=tuple(topics),
         streams=_streams(chosen, topics),
         listen=tuple(
@@ -192,6 +193,7 @@ def plan_recording(
         wanted=wanted,
         time_owner=owners[0] if len(owners) == 1 else None,
         custom=custom,
+        flush_interval=request.flush_interval,
     )
 
 

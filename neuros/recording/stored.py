@@ -1,46 +1,49 @@
-"""Messages that are stored in the files of a bag, read as far as they go, and checked.
+"""Packets that are stored in the files of a bag, read as far as they go, and checked.
 
-A file of a run that was killed, or that something has happened to since, is read from its
-beginning. Checksums of chunks and of the summary tell what is not as it was written.
+MCAP files are read by the ``mcap`` library, since ``rosbags`` gives a message one time and needs an
+index, which the file of a run that was killed lacks. All else that ``rosbags`` knows is read by it.
+Checksums of chunks and of the summary tell what is not as it was written.
 """
 
 from __future__ import annotations
 
 import os
-import sqlite3
-from array import array
-from collections import Counter, defaultdict
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
-from functools import partial
+from contextlib import ExitStack, contextmanager
+from io import BytesIO
 from pathlib import Path
-from struct import error as struct_error
-from struct import unpack, unpack_from
+from struct import Struct, unpack
 from textwrap import shorten
 from typing import Any, BinaryIO, NamedTuple
 from zlib import crc32
 
-from rosbags.interfaces import Connection, MessageDefinitionFormat
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
 from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.metadata import parse_qos
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from neuros.errors import EnvironmentFault
 from neuros.ordinary_files import open_ordinary
-from neuros.recording.bag_files import (
-    CHANNEL,
-    CHUNK,
-    CHUNK_HEAD,
-    CHUNK_INDEX,
-    DATA_END,
-    HEADER,
-    MAGIC,
-    MESSAGE,
-    MESSAGE_HEAD,
-    RECORD_HEAD,
-    types_of_fields,
-)
+from neuros.project.scanner import read_bytes
+from neuros.recording.bag_writer import define, types_of_fields
+
+_RECORD_HEAD = Struct("<BQ")  # kind, length
+_BY_MESSAGE = re.compile(rb"compression_mode\W+message\b", re.IGNORECASE)
 
 
 class Stored(NamedTuple):
@@ -57,53 +60,31 @@ class Stored(NamedTuple):
 
 
 def stored_messages(
-    folder: Path, complain: Callable[[str], object] = lambda _: None
+    folder: Path, complain: Callable[[str], object] = lambda _: None, only: str | None = None
 ) -> Iterator[Stored]:
     """All messages in the files of a bag's folder, as far as they go.
 
     Args:
         complain: told in one sentence of each part of a file that is not as it was written.
-
-    Raises:
-        EnvironmentFault: if they are compressed, which is not how NeuROS records.
+        only: the topic of which the messages are read; all if ``None``.
     """
-    for path in sorted(folder.glob("*.mcap")):
+    files, metadata = _mcap_files(folder), folder / "metadata.yaml"
+    if not files or (metadata.exists() and _BY_MESSAGE.search(read_bytes(metadata))):
+        try:
+            with opened(folder) as reader, damage_of(folder):
+                wanted = [each for each in reader.connections if only in (None, each.topic)]
+                for connection, log_ns, data in reader.messages(wanted) if wanted else ():
+                    yield Stored(connection.topic, log_ns, log_ns, data)
+        except EnvironmentFault as error:
+            complain(str(error))
+        return
+    for path in files:
         with open_ordinary(path) as file:
-            for topic, log_ns, publish_ns, _, data, is_right in _of_mcap(file, complain):
-                yield Stored(topic, log_ns, publish_ns, bytes(data), not is_right)
-    for path in sorted(folder.glob("*.db3")):
-        yield from _of_sqlite(path, complain)
-
-
-class StoredTopics:
-    """The messages of a bag's folder, topic by topic.
-
-    With the first topic an MCAP file is gone through once, and it is noted where each message is:
-    32 bytes for one.
-
-    Args:
-        complain: told in one sentence of each part of a file that is not as it was written.
-    """
-
-    def __init__(self, folder: Path, complain: Callable[[str], object]) -> None:
-        self._folder = folder
-        self._complain = complain
-        self._places: dict[Path, Mapping[str, array[int]]] = {}
-
-    def messages(self, topic: str) -> list[Stored]:
-        """Messages of one topic, as far as they go. Raises ``EnvironmentFault`` as above."""
-        found: list[Stored] = []
-        for path in sorted(self._folder.glob("*.mcap")):
-            with open_ordinary(path) as file:
-                if path not in self._places:
-                    self._places[path] = _places_in(file, self._complain)
-                row = iter(self._places[path].get(topic, ()))
-                for log_ns, publish_ns, start, size in zip(row, row, row, row, strict=True):
-                    data = os.pread(file.fileno(), size, start)
-                    found.append(Stored(topic, log_ns, publish_ns, data))
-        for path in sorted(self._folder.glob("*.db3")):
-            found += _of_sqlite(path, self._complain, topic)
-        return found
+            try:
+                summary, is_whole = _summary_of(file), True
+            except Exception:  # the end is missing or damaged, and mcap may raise anything
+                summary, is_whole = Summary(), False
+            yield from _of_mcap(file, summary, complain, only, has_index=is_whole)
 
 
 def faults_of(folder: Path, counts: Mapping[str, int]) -> list[str]:
@@ -111,9 +92,6 @@ def faults_of(folder: Path, counts: Mapping[str, int]) -> list[str]:
 
     Args:
         counts: by topic, how many messages there should be.
-
-    Raises:
-        EnvironmentFault: as :func:`stored_messages`.
     """
     faults: list[str] = []
     found = Counter(message.topic for message in stored_messages(folder, faults.append))
@@ -139,6 +117,50 @@ def is_whole(folder: Path) -> bool:
         return False
 
 
+class Contents(NamedTuple):
+    """Topics and times of a bag, and the custom data of its metadata."""
+
+    connections: list[Connection]
+    start_ns: int
+    duration_ns: int
+    custom: dict[str, str]
+
+
+def contents_of(folder: Path) -> Contents:
+    """What metadata and index of a bag say; of a bag that was cut off, what its file has.
+
+    Raises:
+        EnvironmentFault: if it cannot be read.
+    """
+    if (folder / "metadata.yaml").exists() or not _mcap_files(folder):
+        with opened(folder) as reader, damage_of(folder):
+            custom = dict(reader.storage.metadata.custom or {})
+            return Contents([*reader.connections], reader.start_time, reader.duration, custom)
+    known, counts, first_ns, last_ns = Summary(), Counter[str](), (1 << 63) - 1, 0
+    for path in _mcap_files(folder):
+        with open_ordinary(path) as file:
+            for message in _of_mcap(file, known, lambda _: None, None, has_index=False):
+                counts[message.topic] += 1
+                first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
+    with damage_of(folder):
+        connections = [
+            Connection(
+                channel.id,
+                channel.topic,
+                known.schemas[channel.schema_id].name,
+                MessageDefinition(
+                    MessageDefinitionFormat.MSG, known.schemas[channel.schema_id].data.decode()
+                ),
+                "",
+                counts[channel.topic],
+                ConnectionExtRosbag2("cdr", parse_qos(channel.metadata["offered_qos_profiles"])),
+                None,
+            )
+            for channel in known.channels.values()
+        ]
+    return Contents(connections, first_ns, max(0, last_ns - first_ns), {})
+
+
 @contextmanager
 def opened(folder: Path) -> Iterator[Reader]:
     """A bag as ``rosbags`` opens it.
@@ -148,7 +170,11 @@ def opened(folder: Path) -> Iterator[Reader]:
     """
     with ExitStack() as stack:
         with damage_of(folder):
-            _check_summaries(folder)
+            for path in folder.glob("*"):
+                if path.suffix in (".mcap", ".db3", ".yaml"):
+                    with open_ordinary(path) as file:
+                        if path.suffix == ".mcap":
+                            _summary_of(file)
             reader = Reader(folder)
             reader.open()
             stack.callback(reader.close)
@@ -157,11 +183,20 @@ def opened(folder: Path) -> Iterator[Reader]:
 
 
 def store_of(connections: Iterable[Connection]) -> Typestore:
-    """The types as a bag defines them. Raises ``ReaderError``, and whatever the parser raises."""
+    """The types as a bag defines them, else as they are installed (ROS 2 before Iron).
+
+    Raises:
+        EnvironmentFault: if a type is neither defined nor installed.
+        ReaderError: if one lacks a part.
+        Exception: whatever the parser raises.
+    """
     store = get_typestore(Stores.EMPTY)
     types: dict[str, Any] = {}
     for connection in connections:
-        types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
+        if connection.msgdef.format == MessageDefinitionFormat.NONE:
+            define(connection.msgtype, store)
+        else:
+            types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
     store.register(types)
     for name, (_, fields) in types.items():
         if unknown := next((used for used in types_of_fields(fields) if used not in types), None):
@@ -194,232 +229,116 @@ def _check_definitions(reader: Reader) -> None:
         raise ReaderError("in metadata.yaml, files is no list")
     storages = folder.storages if folder else ()
     stored = [each for storage in storages for each in storage.connections]
-    there = {each.topic for each in stored}
+    there = {(each.topic, each.msgtype) for each in stored}
     named = {each.topic for each in reader.connections}
     if unnamed := next((e.topic for e in stored if e.msgcount and e.topic not in named), ""):
         raise ReaderError(f"metadata.yaml does not name the topic {unnamed}, which its files have")
     for connection in reader.connections:
         if type(connection.msgcount) is not int or connection.msgcount < 0:
             raise ReaderError(f"{connection.topic} has {connection.msgcount} packets")
-        is_there = connection.topic in there or not connection.msgcount
-        if connection.msgdef.format == MessageDefinitionFormat.NONE or not is_there:
+        if connection.msgcount and (connection.topic, connection.msgtype) not in there:
             what = f"{connection.topic} of type {connection.msgtype}"
             raise ReaderError(f"its files do not have the topic {what}")
 
 
-def _check_summaries(folder: Path) -> None:
-    """Raise ``ReaderError`` where an MCAP file has not the checksum that its footer says.
-
-    Raises ``OSError`` for what is no file, such as a pipe.
-    """
-    for path in folder.glob("*"):
-        if path.suffix in (".mcap", ".db3", ".yaml"):
-            with open_ordinary(path) as file:
-                if path.suffix == ".mcap":
-                    _summary_of(file)
+def _mcap_files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.mcap"))
 
 
-def _summary_of(file: BinaryIO) -> bytes:
-    """The records between the data of an MCAP file and its end, and the start of the last one.
+def _summary_of(file: BinaryIO) -> Summary:
+    """Channels and chunk indexes of an MCAP file.
 
     Raises:
-        ReaderError: if their checksum is wrong.
+        ReaderError: if the file has lost its end, or the checksum of the summary is wrong.
+        Exception: of any kind, if it is damaged and has no checksum.
     """
-    name = Path(file.name).name
-    end = file.seek(0, os.SEEK_END) - len(MAGIC) - 4
+    name, found = Path(file.name).name, Summary()
+    end = file.seek(0, os.SEEK_END) - len(MCAP0_MAGIC) - 4
     if end < 16:
         raise ReaderError(f"{name} has no end")
     file.seek(end - 16)
     start, _, checksum = unpack("<QQI", file.read(20))
     file.seek(min(start, end))
-    summary = file.read(end - min(start, end))
-    if checksum and crc32(summary) != checksum:
+    summary = file.read()
+    if checksum and crc32(summary[: -len(MCAP0_MAGIC) - 4]) != checksum:
         raise ReaderError(f"the summary of {name} is not what was written")
-    return summary
+    if start:
+        for record in StreamReader(BytesIO(summary), skip_magic=True).records:
+            if isinstance(record, Channel):
+                found.channels[record.id] = record
+            elif isinstance(record, ChunkIndex):
+                found.chunk_indexes.append(record)
+    return found
 
 
-def _places_in(file: BinaryIO, complain: Callable[[str], object]) -> Mapping[str, array[int]]:
-    """By topic, four numbers for each message: both times, offset in the file, and length."""
-    places: defaultdict[str, array[int]] = defaultdict(lambda: array("q"))
-    for topic, log_ns, publish_ns, offset, data, _ in _of_mcap(file, complain):
-        places[topic].extend((log_ns, publish_ns, offset, len(data)))
-    return places
-
-
-_Found = tuple[str, int, int, int, memoryview, bool]
-"""Topic, log time, publish time, where in the file the data begin, the data, and whether the
-checksum of the part that they are in is right."""
-
-
-class _Index(NamedTuple):
-    """What the summary of an MCAP file says: topics by channel; start and length of each chunk."""
-
-    topics: dict[int, str]
-    chunks: list[tuple[int, int]]
-
-
-def _index_of(file: BinaryIO) -> _Index | None:
-    """``None`` where the summary is not as it was written, or knows of no chunk.
-
-    Raises:
-        EnvironmentFault: if the chunks are compressed.
-    """
-    index = _Index({}, [])
-    try:
-        summary, at = _summary_of(file), 0
-        while at + RECORD_HEAD.size <= len(summary):
-            kind, size = RECORD_HEAD.unpack_from(summary, at)
-            content = summary[at + RECORD_HEAD.size : at + RECORD_HEAD.size + size]
-            at += RECORD_HEAD.size + size
-            if kind == CHANNEL:
-                _add_channel(content, index.topics)
-            elif kind == CHUNK_INDEX:
-                *_, start, length, offsets = unpack_from("<QQQQI", content)
-                _refuse_compressed(file, *unpack_from("<I", content, 36 + offsets + 8))
-                index.chunks.append((start, length))
-    except (ReaderError, struct_error):
-        return None
-    size = os.fstat(file.fileno()).st_size
-    is_known = all(
-        RECORD_HEAD.size + CHUNK_HEAD.size <= length <= size - start
-        for start, length in index.chunks
-    )
-    return index if index.chunks and is_known else None
-
-
-def _of_mcap(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Found]:
-    """Chunk by chunk, as the summary has them; without a summary, record by record."""
-    index = _index_of(file)
+def _of_mcap(
+    file: BinaryIO,
+    known: Summary,
+    complain: Callable[[str], object],
+    only: str | None,
+    *,
+    has_index: bool,
+) -> Iterator[Stored]:
+    """Messages in the order of the file; ``known`` grows by its schemas and channels."""
     file.seek(0)
-    if not MAGIC.startswith(file.read(len(MAGIC))):  # else it is right, or has been cut off
+    if not MCAP0_MAGIC.startswith(file.read(len(MCAP0_MAGIC))):  # else it has been cut off
         complain(f"{file.name} does not begin as an MCAP file")
-    if index is None:
-        yield from _one_by_one(file, complain)
-        return
-    kind, size = RECORD_HEAD.unpack(file.read(RECORD_HEAD.size))
-    before = file.tell(), min(start for start, _ in index.chunks)
-    if kind != HEADER or size > before[1] - before[0]:
-        complain(f"{file.name} is damaged between bytes {before[0]} and {before[1]}")
-    for start, length in index.chunks:
-        file.seek(start)
-        head, content = file.read(RECORD_HEAD.size), file.read(length - RECORD_HEAD.size)
-        records = len(content) - CHUNK_HEAD.size
-        _, _, size, _, compression, also_size = CHUNK_HEAD.unpack_from(content)
-        is_right = _has_checksum(content)
-        heads = (*RECORD_HEAD.unpack(head), size, compression, also_size)
-        if not is_right or heads != (CHUNK, len(content), records, 0, records):
-            complain(f"{file.name} is damaged between bytes {start} and {start + length}")
-        yield from _of_chunk(content, start + RECORD_HEAD.size, index.topics, is_right)
+    is_indexed = has_index and bool(known.chunk_indexes)
+    for kind, start, end in _indexed(known, only) if is_indexed else _one_by_one(file):
+        records, is_right = _records_of(kind, file, start, end)
+        if not is_right:
+            complain(f"{file.name} is damaged between bytes {start} and {end}")
+        for record in records:
+            if isinstance(record, Schema):
+                known.schemas[record.id] = record
+            elif isinstance(record, Channel):
+                known.channels.setdefault(record.id, record)
+            elif isinstance(record, Message) and record.channel_id in known.channels:
+                topic, publish_ns = known.channels[record.channel_id].topic, record.publish_time
+                is_time = max(record.log_time, publish_ns) < 1 << 63
+                if is_time and only in (None, topic):
+                    yield Stored(topic, record.log_time, publish_ns, record.data, not is_right)
 
 
-def _one_by_one(file: BinaryIO, complain: Callable[[str], object]) -> Iterator[_Found]:
-    file_size = os.fstat(file.fileno()).st_size
-    topics: dict[int, str] = {}
-    while len(head := file.read(RECORD_HEAD.size)) == RECORD_HEAD.size:
-        kind, size = RECORD_HEAD.unpack(head)
-        offset = file.tell()
-        if kind == DATA_END:
+def _indexed(summary: Summary, only: str | None) -> Iterator[tuple[int, int, int]]:
+    """Chunks that have the topic: kind of record, where it begins, where it ends."""
+    topics = {channel.id: channel.topic for channel in summary.channels.values()}
+    for index in summary.chunk_indexes:
+        # Without an index of its messages, a chunk may have any topic.
+        there = {topics.get(each) for each in index.message_index_offsets} or {only}
+        if only is None or only in there:
+            start = index.chunk_start_offset
+            yield Opcode.CHUNK, start, start + index.chunk_length
+
+
+def _one_by_one(file: BinaryIO) -> Iterator[tuple[int, int, int]]:
+    """Whole chunks, and records that are in none: kind, where it begins, where it ends."""
+    at, size = len(MCAP0_MAGIC), os.fstat(file.fileno()).st_size
+    while at + _RECORD_HEAD.size <= size:
+        file.seek(at)
+        kind, length = _RECORD_HEAD.unpack(file.read(_RECORD_HEAD.size))
+        end = at + _RECORD_HEAD.size + length
+        if end > size or kind == Opcode.DATA_END:
             return
-        # A damaged length may be any number: no memory is taken for it.
-        content = file.read(min(size, file_size - offset))
-        if kind == CHUNK:
-            whole = content[: CHUNK_HEAD.size + _size_in(content)]
-            if len(content) >= CHUNK_HEAD.size:
-                _refuse_compressed(file, CHUNK_HEAD.unpack_from(content)[4])
-            is_right = _is_as_written(whole)
-            if not is_right or len(whole) < len(content):
-                complain(f"{file.name} is damaged between bytes {offset} and {file.tell()}")
-            file.seek(offset + len(whole))
-            yield from _of_chunk(whole, offset, topics, is_right)
-        elif size > len(content) and (distance := _next_chunk(content)) is not None:
-            complain(f"{file.name} is damaged between bytes {offset} and {offset + distance}")
-            file.seek(offset + distance)
-
-
-def _next_chunk(content: bytes) -> int | None:
-    """Where a record after a damaged length is a whole chunk with the right checksum."""
-    at = content.find(CHUNK)
-    while at >= 0:
-        start = at + RECORD_HEAD.size
-        if start + CHUNK_HEAD.size > len(content):
-            return None
-        size = RECORD_HEAD.unpack_from(content, at)[1]
-        _, _, records, checksum, *_ = CHUNK_HEAD.unpack_from(content, start)
-        is_there = size == CHUNK_HEAD.size + records <= len(content) - start
-        if checksum and is_there and _is_as_written(content[start : start + size]):
-            return at
-        at = content.find(CHUNK, at + 1)
-    return None
-
-
-def _size_in(chunk: bytes) -> int:
-    """The length of the records in a chunk without compression, as it says itself."""
-    return int(CHUNK_HEAD.unpack_from(chunk)[2]) if len(chunk) >= CHUNK_HEAD.size else 0
-
-
-def _is_as_written(chunk: bytes) -> bool:
-    """Whether the checksum of a chunk is right; a chunk that was cut off counts as that."""
-    return len(chunk) < CHUNK_HEAD.size + _size_in(chunk) or _has_checksum(chunk)
-
-
-def _has_checksum(chunk: bytes) -> bool:
-    """Whether the checksum of a whole chunk is right, if it has one."""
-    checksum = CHUNK_HEAD.unpack_from(chunk)[3]
-    return not checksum or crc32(memoryview(chunk)[CHUNK_HEAD.size :]) == checksum
-
-
-def _of_chunk(
-    content: bytes, offset: int, topics: dict[int, str], is_right: bool
-) -> Iterator[_Found]:
-    """The messages of a chunk without compression; ``topics`` grows by its channels."""
-    if len(content) < CHUNK_HEAD.size:
-        return
-    at = CHUNK_HEAD.size
-    view = memoryview(content)
-    while at + RECORD_HEAD.size <= len(content):
-        kind, size = RECORD_HEAD.unpack_from(content, at)
-        at += RECORD_HEAD.size
-        end = at + size
-        if end > len(content):
-            return
-        if kind == CHANNEL:
-            _add_channel(content[at:end], topics)
-        elif kind == MESSAGE and size >= MESSAGE_HEAD.size:
-            number, _, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content, at)
-            start = at + MESSAGE_HEAD.size
-            if number in topics and max(log_ns, publish_ns) < 1 << 63:
-                data = view[start:end]
-                yield topics[number], log_ns, publish_ns, offset + start, data, is_right
+        if kind in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
+            yield kind, at, end
         at = end
 
 
-def _add_channel(record: bytes, topics: dict[int, str]) -> None:
-    length = int.from_bytes(record[4:8], "little")
-    number = int.from_bytes(record[:2], "little")
-    topics.setdefault(number, record[8 : 8 + length].decode(errors="replace"))
-
-
-def _refuse_compressed(file: BinaryIO, name_length: int) -> None:
-    """Raise ``EnvironmentFault`` where the name of a compression is not empty."""
-    if name_length:
-        raise EnvironmentFault(
-            f"{file.name}: its chunks are compressed, which this reader does not read"
-        )
-
-
-def _of_sqlite(
-    path: Path, complain: Callable[[str], object], only: str | None = None
-) -> Iterator[Stored]:
-    query = (
-        "SELECT topics.name, timestamp, data FROM messages"
-        " JOIN topics ON topics.id = topic_id WHERE ?1 IS NULL OR topics.name = ?1"
-        " ORDER BY messages.id"
-    )
-    with closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as connection:
-        connection.text_factory = partial(str, encoding="utf-8", errors="replace")
+def _records_of(kind: int, file: BinaryIO, start: int, end: int) -> tuple[list[McapRecord], bool]:
+    """A record, or those of a chunk, and whether it is as it was written."""
+    try:
+        file.seek(start + _RECORD_HEAD.size)
+        size = min(end, os.fstat(file.fileno()).st_size) - file.tell()
+        stream = ReadDataStream(BytesIO(file.read(size)))
+        if kind == Opcode.MESSAGE:
+            return [Message.read(stream, size)], True
+        if kind != Opcode.CHUNK:
+            return [Schema.read(stream) if kind == Opcode.SCHEMA else Channel.read(stream)], True
+        chunk = Chunk.read(stream)
         try:
-            for topic, log_ns, data in connection.execute(query, (only,)):
-                if [type(topic), type(log_ns), type(data)] == [str, int, bytes] and log_ns >= 0:
-                    yield Stored(topic, log_ns, log_ns, data)
-        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:  # texts of errors quote names
-            complain(f"{path} is damaged ({error})")
+            return breakup_chunk(chunk, validate_crc=True), True
+        except CRCValidationError:
+            return breakup_chunk(chunk), False
+    except Exception:  # the library may raise anything for other bytes
+        return [], False

@@ -509,7 +509,8 @@ def test_digests_need_a_packet_log(project: Path, capsys: pytest.CaptureFixture[
     [
         ("lauch p", "there is no command 'lauch' (did you mean 'launch'?)"),
         ("bag inf p", "there is no action 'inf' (did you mean 'info'?)"),
-        ("launch p --storage mcp", "'sqlite3', but is 'mcp' (did you mean 'mcap'"),
+        ("verify a b --format jsn", "'json', but is 'jsn' (did you mean 'json'"),
+        ("launch p --flush-interval 0", "'0' is not a number above 0"),
         ("launch p --peer-timeout x", "'x' is not a whole number from 1 on"),
         ("replay p --rate fast", "'fast' is not a number"),
         ("launch p -o", "argument -o/--output: needs a value"),

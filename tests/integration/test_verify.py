@@ -138,7 +138,7 @@ def test_in_process_what_was_recorded_is_compared(
     if back_end == "process":
         other = rally
     else:
-        options = ("--backend", "in-process", "-r", "--storage", "sqlite3")
+        options = ("--backend", "in-process", "-r")
         other = run(tmp_path / "second", *options, project=players)
     code, text = verify(first, other, capsys)
     assert code == 0, text

@@ -2,31 +2,27 @@
 
 from __future__ import annotations
 
-import errno
-import io
 import json
 import os
+import resource
 import time
+import tracemalloc
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.records import ChunkIndex, SummaryOffset
-from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from recordings import ANSWER, NUMBER, answer, fail, number, plan, record, spool
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+import neuros.bag
 from neuros.errors import EnvironmentFault
 from neuros.recording import recorder as recording
-from neuros.recording.bag_files import BagWriter
 from neuros.recording.recorder import Recorder, repair
 from neuros.recording.recording_plan import RecordingPlan, Stream, Topic, load_plan
 from neuros.recording.spool import NO_TIME, ListenedSpool, SpoolWriter
@@ -114,24 +110,6 @@ def test_mcap_reads_index_and_both_times(tmp_path: Path) -> None:
     assert found == [(10, 500, 1), (10, 500, 1), (30, 600, 2), (30, 600, 2)]
 
 
-def test_the_parts_of_the_summary_are_where_it_says(tmp_path: Path) -> None:
-    recorder = Recorder(plan(), tmp_path, fail)
-    for at in range(3):
-        recorder.bag.put(1, at, at, bytes(600_000))  # two to a chunk
-    recorder.complete()
-    data = bag_file(tmp_path).read_bytes()
-    records = [*StreamReader(io.BytesIO(data), emit_chunks=True).records]
-    offsets = [each for each in records if isinstance(each, SummaryOffset)]
-    assert [each.group_opcode for each in offsets] == [3, 4, 8, 0x0D, 0x0B]
-    assert all(data[each.group_start] == each.group_opcode for each in offsets)
-    indexes = [each for each in records if isinstance(each, ChunkIndex)]
-    times = [(each.message_start_time, each.message_end_time) for each in indexes]
-    assert times == [(0, 0), (0, 1), (2, 2)]  # the first chunk has definitions alone
-    for each in indexes:
-        assert data[each.chunk_start_offset] == 6
-        assert all(data[at] == 7 for at in each.message_index_offsets.values())
-
-
 def test_metadata_keep_every_letter(tmp_path: Path) -> None:
     text = 'Größe 大きさ 🤖: "a\\b"\n- c\t#'
     recorder = Recorder(replace(plan(), custom={"project": text}), tmp_path, fail)
@@ -149,49 +127,21 @@ def test_mcap_ros2_support_decodes_the_messages(tmp_path: Path) -> None:
         assert [each.decoded_message.data for each in decoded] == [1, 3]
 
 
-def test_sqlite3_on_request(tmp_path: Path) -> None:
-    spool(tmp_path, "a", [(10, None, number(1))])
-    record(tmp_path, plan("sqlite3"))
-    assert (tmp_path / "bag" / "bag.db3").is_file()
-    with Reader(tmp_path / "bag") as reader:
-        assert [(at, data) for _, at, data in reader.messages()] == [(10, number(1))] * 2
-
-
-def test_a_bag_is_readable_before_the_first_packet_and_at_every_checkpoint(tmp_path: Path) -> None:
-    recorder = Recorder(plan(), tmp_path, fail)
-    for count in range(5):
-        with Reader(tmp_path / "bag") as reader:
-            assert reader.message_count == 2 * count
-            assert len(list(reader.messages())) == 2 * count
-        recorder.bag.put(1, 10 + count, 0, number(count))
-        recorder.bag.put(2, 10 + count, 0, bytes(2_000_000))
-        recorder.bag.checkpoint()
-    recorder.abandon()
-
-
-@pytest.mark.parametrize(("took_s", "pause_s"), [(0.001, 1.0), (0.1, 5.0)])
-def test_checkpoints_take_a_fiftieth_of_the_time_at_most(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, took_s: float, pause_s: float
-) -> None:
-    now_s, begun_s = 0.0, []
-    recorder = Recorder(plan(), tmp_path, fail, clock=lambda: now_s)
-
-    def checkpoint() -> None:
-        nonlocal now_s
-        begun_s.append(now_s)
-        now_s += took_s
-
-    monkeypatch.setattr(recorder.bag, "checkpoint", checkpoint)
+def test_a_bag_that_is_still_written_has_the_packets_up_to_the_last_flush(tmp_path: Path) -> None:
+    now_s, what = 0.0, plan(flush_interval=2.0)
+    what.save(tmp_path)
+    recorder = Recorder(what, tmp_path, fail, clock=lambda: now_s)
     sender = SpoolWriter(tmp_path / "a", ())
-    for place in range(100):
-        sender.append(10 + place, NO_TIME, 0, number(1))
+    found = []
+    for now_s in range(6):
+        sender.append(10 + now_s, NO_TIME, 0, number(now_s))
         recorder.poll()
-        now_s += 0.125
+        with neuros.bag.open(tmp_path) as bag:
+            found.append([*bag[NUMBER.name].array()["data"]] if bag.topics else [])
+            assert bag.custom == {"run_id": "0123"}
     sender.close()
     recorder.abandon()
-    pauses_s = [after - before - took_s for before, after in pairwise(begun_s)]
-    assert pauses_s
-    assert all(-1e-9 < each - pause_s < 0.13 for each in pauses_s)
+    assert found == [[], [], [0, 1, 2], [0, 1, 2], [0, 1, 2, 3, 4], [0, 1, 2, 3, 4]]
 
 
 def test_spools_are_gone_when_their_packets_are_in_the_bag(tmp_path: Path) -> None:
@@ -203,7 +153,6 @@ def test_spools_are_gone_when_their_packets_are_in_the_bag(tmp_path: Path) -> No
 
 def test_a_type_without_definition_is_said_and_the_others_are_recorded(tmp_path: Path) -> None:
     what = RecordingPlan(
-        storage="mcap",
         topics=(Topic("/odd", "odd_msgs/msg/Odd"), ANSWER),
         streams={"b": (Stream("sent", "odd", (0,)), Stream("sent", "answer", (1,)))},
     )
@@ -212,7 +161,9 @@ def test_a_type_without_definition_is_said_and_the_others_are_recorded(tmp_path:
     recorder = Recorder(what, tmp_path, complaints.append)
     recorder.complete()
     (complaint,) = complaints
-    assert complaint.startswith("/odd is not recorded: message type odd_msgs/msg/Odd")
+    assert complaint.startswith(
+        "/odd is not recorded: the definition of message type odd_msgs/msg/Odd"
+    )
     assert recorder.counts() == {"/odd": 0, "/answer": 0}
 
 
@@ -231,10 +182,8 @@ def test_packets_do_not_pile_up_where_somebody_sets_the_clock_back(
 def test_a_spool_stays_while_a_packet_of_it_is_held_back(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording, "_CHECKPOINT_S", 0.0)
-    monkeypatch.setattr(recording, "_CHECKPOINT_PAUSE", 0)
     monkeypatch.setattr(recording, "_MOST_BYTES", 72)  # two packets of a node at a time
-    recorder = Recorder(plan(), tmp_path, fail)
+    recorder = Recorder(plan(flush_interval=0.0), tmp_path, fail)
     recorder.poll()
     spool(tmp_path, "a", [(wall_ns, None, number(0)) for wall_ns in (110, 150, 160, 170, 180)])
     late = SpoolWriter(tmp_path / "b", (), file_bytes=1)
@@ -248,40 +197,24 @@ def test_a_spool_stays_while_a_packet_of_it_is_held_back(
     recorder.abandon()
 
 
-def test_a_full_disk_leaves_the_bag_of_the_last_checkpoint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_leaves_the_packets_up_to_the_last_flush(tmp_path: Path) -> None:
+    plan().save(tmp_path)
     recorder = Recorder(plan(), tmp_path, fail)
     recorder.bag.put(1, 10, 10, number(1))
-    recorder.bag.checkpoint()
-    room = 100  # bytes that still fit behind what was written before
-    pwrite = os.pwrite
-    end = bag_file(tmp_path).stat().st_size + room
-
-    def little_room(descriptor: int, data: bytes, at: int) -> int:
-        if at >= end:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return pwrite(descriptor, memoryview(data)[: end - at], at)
-
-    monkeypatch.setattr(os, "pwrite", little_room)
-    recorder.bag.put(1, 20, 20, bytes(50_000))
-    with pytest.raises(OSError, match="No space left"):
-        recorder.bag.checkpoint()
-    recorder.abandon()
-    with Reader(tmp_path / "bag") as reader:
-        assert [at for _, at, _ in reader.messages()] == [10]
-
-
-def test_a_full_disk_leaves_the_sqlite_bag_of_the_last_checkpoint(tmp_path: Path) -> None:
-    recorder = Recorder(plan(storage="sqlite3"), tmp_path, fail)
-    recorder.bag.put(1, 10, 10, number(1))
-    recorder.bag.checkpoint()
-    recorder.bag._file._connection.execute("PRAGMA max_page_count=1")  # as many as there are
-    with pytest.raises(OSError, match="disk is full"):
-        recorder.bag.put(1, 20, 20, bytes(50_000))
-    recorder.abandon()
-    with Reader(tmp_path / "bag") as reader:
-        assert [at for _, at, _ in reader.messages()] == [10]
+    recorder.bag.flush()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    room = bag_file(tmp_path).stat().st_size + 100
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+        recorder.bag.put(1, 20, 20, os.urandom(50_000))
+        with pytest.raises(OSError, match="File too large"):
+            recorder.bag.flush()
+        recorder.abandon()
+        with neuros.bag.open(tmp_path) as bag:  # there is no room to complete it
+            assert bag[NUMBER.name].array()["log_time_ns"].tolist() == [10]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert counts_after_repair(tmp_path)[NUMBER.name] == 1
 
 
 # ---------------------------------------------------------------------- what was cut off
@@ -298,27 +231,25 @@ def test_a_complete_bag_needs_no_repair(tmp_path: Path) -> None:
     numbers=st.lists(st.integers(-9, 9), min_size=1, max_size=30),
     moved=st.integers(0, 30),
     kept=st.floats(0, 1),
-    storage=st.sampled_from(["mcap", "sqlite3"]),
 )
 def test_repair_brings_together_the_file_and_the_spools_without_doubles(
     tmp_path_factory: pytest.TempPathFactory,
     numbers: list[int],
     moved: int,
     kept: float,
-    storage: str,
 ) -> None:
     run = tmp_path_factory.mktemp("run")
-    plan(storage).save(run)
+    plan().save(run)
     packets = [(10 * k, None, number(value)) for k, value in enumerate(numbers, start=1)]
     spool(run, "a", packets)
-    recorder = Recorder(plan(storage), run, fail)
+    recorder = Recorder(plan(), run, fail)
     for wall_ns, _, data in packets[:moved]:
         for topic in (1, 2):
             recorder.bag.put(topic, wall_ns, wall_ns, data)
-    recorder.bag.checkpoint()
+    recorder.bag.flush()
     recorder.abandon()
-    if storage == "mcap":  # cut off anywhere: the spools still have it all
-        os.truncate(bag_file(run), int(kept * bag_file(run).stat().st_size))
+    # Cut off anywhere: the spools still have it all.
+    os.truncate(bag_file(run), int(kept * bag_file(run).stat().st_size))
     counts = counts_after_repair(run)
     assert counts == {NUMBER.name: len(numbers), plan().topics[1].name: len(numbers), "/answer": 0}
     with Reader(run / "bag") as reader:
@@ -333,7 +264,7 @@ def test_a_truncated_bag_keeps_what_is_left_of_it(tmp_path: Path) -> None:
     sizes = []
     for k in range(3):
         recorder.bag.put(1, k + 1, k + 1, number(k))
-        recorder.bag.checkpoint()
+        recorder.bag.flush()
         sizes.append(bag_file(tmp_path).stat().st_size)
     recorder.abandon()
     os.truncate(bag_file(tmp_path), sizes[0])
@@ -354,26 +285,19 @@ def test_a_repair_that_was_cut_off_is_repeated(tmp_path: Path) -> None:
     assert not (tmp_path / "bag.damaged").exists()
 
 
-def test_a_bag_larger_than_memory_can_be_repaired(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bag_larger_than_memory_can_be_repaired(tmp_path: Path) -> None:
     recorder = Recorder(plan(), tmp_path, fail)
     plan().save(tmp_path)
     for k in range(40):
         recorder.bag.put(1, k + 1, k + 1, bytes(1 << 20))
-    recorder.bag.checkpoint()
+    recorder.bag.flush()
     recorder.abandon()
-    os.truncate(bag_file(tmp_path), bag_file(tmp_path).stat().st_size - 10)
-    most_bytes = 0
-    put = BagWriter.put
-
-    def watched(bag: BagWriter, *arguments: Any) -> None:
-        nonlocal most_bytes
-        put(bag, *arguments)
-        most_bytes = max(most_bytes, bag.pending_bytes)
-
-    monkeypatch.setattr(BagWriter, "put", watched)
-    counts = counts_after_repair(tmp_path)
+    tracemalloc.start()
+    try:
+        counts = counts_after_repair(tmp_path)
+        _, most_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
     assert counts[NUMBER.name] == 40
     assert most_bytes < 20 << 20
 
@@ -433,7 +357,7 @@ def test_a_damaged_list_of_topics_costs_nothing(
     plan().save(tmp_path)
     recorder = Recorder(plan(), tmp_path, fail)
     recorder.copy(heard, Stored("/heard", 5, 5, number(5)))
-    recorder.bag.checkpoint()
+    recorder.bag.flush()
     recorder.abandon()
     spool(tmp_path, "a", [(10, None, number(7))])
     listened = ListenedSpool(tmp_path)
@@ -459,8 +383,8 @@ def test_a_name_that_is_no_type_s_is_no_topic_of_the_bag(tmp_path: Path, name: s
     assert recorder.number_of(Topic("/heard", name)) is None
     recorder.complete()
     assert told == [
-        f"/heard is not recorded: message type {name} cannot be recorded: its definition"
-        f" (share/{name}.msg) is not installed here"
+        f"/heard is not recorded: the definition of message type {name} (share/{name}.msg) is not"
+        " installed here"
     ]
 
 

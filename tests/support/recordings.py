@@ -14,10 +14,9 @@ ALSO = Topic("/neuros/a/number/c/number/data", "std_msgs/msg/Int32", False, 1, "
 ANSWER = Topic("/answer", "std_msgs/msg/Float64")
 
 
-def plan(storage: str = "mcap", time_owner: str | None = None) -> RecordingPlan:
+def plan(time_owner: str | None = None, flush_interval: float = 1.0) -> RecordingPlan:
     """Node a sends to b and c what is kept once; node b publishes on an external topic."""
     return RecordingPlan(
-        storage=storage,
         topics=(NUMBER, ALSO, ANSWER),
         streams={
             "a": (Stream("sent", "number", (0, 1)),),
@@ -25,6 +24,7 @@ def plan(storage: str = "mcap", time_owner: str | None = None) -> RecordingPlan:
         },
         time_owner=time_owner,
         custom={"run_id": "0123"},
+        flush_interval=flush_interval,
     )
 
 

@@ -73,7 +73,7 @@ def frame(topic: RecordedTopic, clock: Literal["wall", "sim"]) -> Any:
         if not has_simulated_time(columns):
             raise UsageError(
                 f"{topic.name} has no simulated time: no node of the run owns time, or the bag"
-                ' is an SQLite file, which has no place for it. Use clock="wall"'
+                ' is no MCAP file, and others have no place for it. Use clock="wall"'
             )
         time = pd.to_timedelta(columns[PUBLISH_TIME], unit="ns")
     else:

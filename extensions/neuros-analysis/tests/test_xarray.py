@@ -32,7 +32,7 @@ def dataset(run: Path, messages: list[Any], *, has_simulated_time: bool = True) 
     ]
     spool(run, "a", packets)
     owner = "a" if has_simulated_time else None
-    record(run, RecordingPlan("mcap", (topic,), streams, time_owner=owner))
+    record(run, RecordingPlan((topic,), streams, time_owner=owner))
     with neuros.bag.open(run) as bag:
         return bag["/t"].xarray()
 
