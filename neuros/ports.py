@@ -570,16 +570,6 @@ class Finding:
         return f"{self.state.value:<8} {self.subject:<12} {self.text}{remedy}"
 
 
-class SimulatorKind(ABC):
-    """A simulator. Registered as an entry point of the group ``neuros.simulators``."""
-
-    name: str
-
-    @abstractmethod
-    def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
-        """What ``neuros doctor`` finds of it: its version, or how to install it; what it needs."""
-
-
 @dataclass(frozen=True)
 class Subcommand:
     """A command of ``neuros``. Registered as an entry point of the group ``neuros.commands``.

@@ -36,7 +36,6 @@ from neuros.ports import (
     DeploymentKind,
     ModelFormat,
     Notice,
-    SimulatorKind,
     Subcommand,
     SweepExecutor,
     TransportKind,
@@ -181,7 +180,6 @@ MODELS: Registry[ModelFormat] = Registry(
 EXECUTORS: Registry[SweepExecutor] = Registry("neuros.executors", "executor", SweepExecutor)
 BAG_FORMATS: Registry[Callable[..., Any]] = Registry("neuros.bag_formats", "format", object)
 """What methods of recorded topics and runs return in the types of other libraries."""
-SIMULATORS: Registry[SimulatorKind] = Registry("neuros.simulators", "simulator", SimulatorKind)
 
 
 class _Alias(Loader):

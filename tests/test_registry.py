@@ -11,7 +11,7 @@ import pytest
 
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import BackEnd
-from neuros.registry import BACK_ENDS, EXECUTORS, OWN, SIMULATORS, TRANSPORTS
+from neuros.registry import BACK_ENDS, EXECUTORS, OWN, TRANSPORTS
 from neuros.viewers.viewer import VIEWERS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -28,8 +28,8 @@ def test_our_back_ends_can_be_loaded_and_say_what_help_needs(name: str) -> None:
     assert back_end.place
 
 
-def test_our_transports_simulators_viewers_and_executors_can_be_loaded() -> None:
-    for registry in (TRANSPORTS, SIMULATORS, VIEWERS, EXECUTORS):
+def test_our_transports_viewers_and_executors_can_be_loaded() -> None:
+    for registry in (TRANSPORTS, VIEWERS, EXECUTORS):
         assert [registry.load(name).name for name in registry] == [*registry]
 
 

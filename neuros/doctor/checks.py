@@ -25,9 +25,9 @@ from neuros.backends.node_command import usable_cores
 from neuros.distribution import install_command, python_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine, answer_of, install_opengl, offscreen_opengl
-from neuros.ports import Finding, SimulatorKind, State
+from neuros.ports import BackEnd, Finding, State
 from neuros.recording.run_file import read_run_file
-from neuros.registry import BACK_ENDS, SIMULATORS, Part, Registry, option_values
+from neuros.registry import BACK_ENDS, option_values
 from neuros.stacks import allow_reading, threads_of
 
 PROJECT = Path(__file__).with_name("delivery")
@@ -46,11 +46,9 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
         proves: whether to start nodes on each back end that can be used.
     """
     yield from look_at_machine(environ)
-    simulators, broken = _parts(SIMULATORS)
-    back_ends, broken_too = _parts(BACK_ENDS)
-    yield from (*broken, *broken_too)
-    for simulator in simulators:
-        yield from simulator.checks(environ)
+    yield from look_at_simulators(environ)
+    back_ends, broken = _back_ends()
+    yield from broken
     for back_end in back_ends:
         yield from back_end.checks(environ)
     if not proves:
@@ -67,19 +65,19 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
             yield prove_delivery(back_end.name)
 
 
-def _parts(registry: Registry[Part]) -> tuple[list[Part], list[Finding]]:
-    """What can be loaded, and what is wrong with the rest."""
-    parts: list[Part] = []
+def _back_ends() -> tuple[list[BackEnd], list[Finding]]:
+    """The back ends that can be loaded, and what is wrong with the others."""
+    loaded: list[BackEnd] = []
     broken: list[Finding] = []
     try:
-        for name in registry:
+        for name in BACK_ENDS:
             try:
-                parts.append(registry.load(name))
+                loaded.append(BACK_ENDS.load(name))
             except EnvironmentFault as fault:
-                broken.append(Finding.bad(registry.noun, str(fault)))
+                broken.append(Finding.bad(BACK_ENDS.noun, str(fault)))
     except EnvironmentFault as fault:  # two distributions share a name
-        broken.append(Finding.bad(registry.noun, str(fault)))
-    return parts, broken
+        broken.append(Finding.bad(BACK_ENDS.noun, str(fault)))
+    return loaded, broken
 
 
 def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
@@ -94,6 +92,13 @@ def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
     yield _stacks()
     yield _display(environ)
     yield _gpu()
+
+
+def look_at_simulators(environ: Mapping[str, str]) -> Iterator[Finding]:
+    """All findings about simulators, one after another."""
+    yield installed("MuJoCo", "mujoco", install_command("mujoco"))
+    yield prove_rendering(environ)
+    yield installed("NEST", "nest-simulator", install_command("nest"))
 
 
 def _python() -> Finding:
@@ -156,25 +161,6 @@ def _gpu() -> Finding:
     except (OSError, subprocess.SubprocessError) as error:
         return Finding.bad("GPU", f"nvidia-smi fails ({error})", "mend the driver")
     return Finding.good("GPU", "; ".join(answer.stdout.split("\n")).strip("; "))
-
-
-class _MuJoCo(SimulatorKind):
-    name = "mujoco"
-
-    def checks(self, environ: Mapping[str, str]) -> Iterator[Finding]:
-        yield installed("MuJoCo", "mujoco", install_command("mujoco"))
-        yield prove_rendering(environ)
-
-
-class _Nest(SimulatorKind):
-    name = "nest"
-
-    def checks(self, environ: Mapping[str, str]) -> Iterator[Finding]:
-        yield installed("NEST", "nest-simulator", install_command("nest"))
-
-
-MUJOCO = _MuJoCo()
-NEST = _Nest()
 
 
 def installed(subject: str, distribution: str, remedy: str) -> Finding:

@@ -13,7 +13,6 @@ import pytest
 from neuros.backends.docker.back_end import look_at_containers
 from neuros.doctor import checks
 from neuros.ports import Finding, State
-from neuros.registry import SIMULATORS
 from neuros.stacks import ProcessThreads
 
 
@@ -34,11 +33,11 @@ def test_missing_ros_is_a_problem_and_a_missing_simulator_is_not(
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "version", version)
-    ros, nest = findings()["ROS 2"], next(iter(SIMULATORS.load("nest").checks({})))
+    ros, mujoco = findings()["ROS 2"], next(checks.look_at_simulators({}))
     assert ros.state is State.BAD
     assert "./install.py" in ros.remedy
-    assert nest.state is State.ABSENT
-    assert "--extras nest" in nest.remedy
+    assert mujoco.state is State.ABSENT
+    assert "--extras mujoco" in mujoco.remedy
 
 
 def test_shared_memory_that_is_missing_is_named(
