@@ -198,7 +198,7 @@ def each_time(backend: str) -> pytest.MarkDecorator:
 
 
 def killed_in_a_hook(running: Running, timeout_s: float) -> Finished:
-    """A run of ``neuros/testing/projects/stuck``, after Ctrl+C twice."""
+    """A run of ``tests/integration/back_ends/stuck``, after Ctrl+C twice."""
     running.wait_for("[reader]: computing", timeout_s)
     running.signal(signal.SIGINT)
     running.wait_for("a second one kills at once")

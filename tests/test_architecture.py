@@ -123,7 +123,6 @@ THIRD_PARTY: dict[str, set[str]] = {
     "bag": {"rosbags", "numpy"},
     "viewers.dashboard": {"starlette", "uvicorn"},
     "viewers.rerun_feed": {"rerun", "numpy"},
-    "testing": {"pytest", "hypothesis"},
 }
 # The engine is pure: no threads, no wall clock, no files.
 IMPURE = {

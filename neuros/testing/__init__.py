@@ -1,9 +1,4 @@
-"""Test tools: a harness for plugins, and the suite of checks for transports.
-
-:class:`PluginHarness` runs one plugin on the real engine, without ROS processes and without a
-launcher; :class:`~neuros.testing.transports.TransportChecks` is the suite that every transport
-passes.
-"""
+"""Test tools: :class:`PluginHarness` runs one plugin on the real engine, without ROS processes."""
 
 from neuros.testing.harness import PluginHarness
 from neuros.testing.stand_ins import Record, wire

@@ -9,8 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
-
-from neuros.testing.back_ends import BackEndChecks, Launched, finish, launcher
+from back_end_checks import BackEndChecks, Launched, finish, launcher
 
 if sys.version_info >= (3, 11):
     import tomllib

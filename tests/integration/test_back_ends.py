@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from back_end_checks import PROJECTS, BackEndChecks
 from launching import BACKENDS, start
 from ros_program import RosProgram
 from std_msgs.msg import Int32
@@ -12,7 +13,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from containers import require_containers
 from neuros.backends.domain import choose_domain
-from neuros.testing.back_ends import PROJECTS, BackEndChecks
 
 TIMEOUT_S = 60.0
 

@@ -15,10 +15,10 @@ import pytest
 import test_transports
 from launching import Finished, launch
 from machines import require_machines
+from transport_checks import SERIES, TransportBench
 
 from neuros.project.model import Connection, NodeFile
 from neuros.testing.stand_ins import wire
-from neuros.testing.transports import SERIES, TransportBench
 from neuros.transport.large_packets import LargeCodecs
 from neuros.transport.messages import make_packet
 
@@ -51,7 +51,7 @@ class TestCompressedRosTransport(test_transports.TestRosTransport):
 
     @pytest.fixture(autouse=True)
     def compression(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("neuros.testing.transports.wire", compressed)
+        monkeypatch.setattr("transport_checks.wire", compressed)
 
 
 @pytest.fixture

@@ -13,11 +13,11 @@ from pathlib import Path
 import pytest
 from launching import Finished, launch, start
 from test_transports import RosNetwork
+from transport_checks import SERIES, TransportBench
 
 from neuros.backends.domain import choose_domain
 from neuros.project.model import NodeFile
 from neuros.testing.stand_ins import wire
-from neuros.testing.transports import SERIES, TransportBench
 from neuros.transport import large_packets
 from neuros.transport.messages import make_packet
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 from ros_program import RosProgram
+from transport_checks import TransportChecks
 
 from neuros.backends.domain import choose_domain
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
-from neuros.testing.transports import TransportChecks
 from neuros.transport.executors import EXECUTOR_VARIABLE
 from neuros.transport.ros_process import RosProcess
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from transport_checks import TransportBench, TransportChecks
+
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
 from neuros.testing.stand_ins import ManualClock, StepLoop, Topics, Workbench, wire
-from neuros.testing.transports import TransportBench, TransportChecks
 
 
 class MemoryNetwork:

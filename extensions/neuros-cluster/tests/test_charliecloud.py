@@ -8,10 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from back_end_checks import BackEndChecks, Launched
 from needs import require
 
 from containers import require_containers
-from neuros.testing.back_ends import BackEndChecks, Launched
 
 pytestmark = pytest.mark.acceptance
 _CONVERTED_S = 1200.0

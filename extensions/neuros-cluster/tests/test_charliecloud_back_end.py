@@ -99,7 +99,7 @@ def test_the_doctor_says_which_images_there_are(folder: Path) -> None:
 def test_a_back_end_is_tried_with_the_defaults_of_its_options(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(checks, "_parts", lambda registry: ([BACK_END], []))
+    monkeypatch.setattr(checks, "_back_ends", lambda: ([BACK_END], []))
     monkeypatch.setattr("neuros_cluster.charliecloud._require_runner", lambda environ: None)
     *_, delivery = (each for each in checks.findings({}, proves=True) if each.subject == "delivery")
     assert "charliecloud: not tried" in delivery.text

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from back_end_checks import PROJECTS
 from ending_bench import Bench, assert_ended
 from launching import Finished, Running, killed_in_a_hook, launch, start
 from neuros_cluster.deployment_file import Host
@@ -26,7 +27,6 @@ from containers import wait_until
 from neuros.control.link import encode
 from neuros.errors import EnvironmentFault
 from neuros.stacks import ProcessThreads
-from neuros.testing.back_ends import PROJECTS
 
 STREAM = Path(__file__).parents[3] / "tests/integration/network/stream"
 NEUROS = Path(sys.executable).with_name("neuros")

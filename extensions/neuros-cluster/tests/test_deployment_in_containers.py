@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from back_end_checks import PROJECTS
 from docker import DockerClient
 from launching import Running, killed_in_a_hook, launch, start
 from neuros_cluster.remote_engine import AGENT_LABEL
 
 from containers import connected, require_containers, wait_until
-from neuros.testing.back_ends import PROJECTS
 
 HERE = Path(__file__).parents[3] / "tests/integration"
 STREAM = HERE / "network" / "stream"

@@ -1,11 +1,4 @@
-"""The suite that every transport passes.
-
-A transport is checked by deriving a class for pytest and telling it how nodes are joined::
-
-    class TestMyTransport(TransportChecks):
-        def network(self, files):
-            return MyNetwork(files)
-"""
+"""What each transport guarantees."""
 
 from __future__ import annotations
 

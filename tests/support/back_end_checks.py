@@ -1,15 +1,4 @@
-"""Suite of checks of what each back end guarantees.
-
-A distribution with a back end runs it by a test module of a few lines::
-
-    from neuros.testing.back_ends import BackEndChecks
-
-    class TestSlurm(BackEndChecks):
-        back_end = "slurm"
-        options = ("--partition", "short")
-
-Each check runs a small project with ``neuros launch --backend`` and looks at what it leaves.
-"""
+"""What each back end guarantees, on small projects that ``neuros launch --backend`` runs."""
 
 from __future__ import annotations
 
@@ -31,7 +20,7 @@ from neuros.backends.run_processes import RunProcesses
 from neuros.backends.sessions import sessions
 from neuros.distribution import python_command
 
-PROJECTS = Path(__file__).with_name("projects").resolve()
+PROJECTS = Path(__file__).parents[1] / "integration" / "back_ends"
 COUNT = 200
 TIMEOUT_S = 60.0
 _LOOK_S = 0.05
