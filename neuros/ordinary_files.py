@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import io
-import math
 import os
 import pwd
 import stat
-import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 _APPEND = os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
@@ -67,45 +64,6 @@ def open_log(path: Path) -> BinaryIO:
         return open_new(path)
     os.set_blocking(descriptor, True)
     return open(descriptor, "ab")
-
-
-class _Log(io.FileIO):
-    """A log that goes without what has no room, on the disk or in ``most_bytes``."""
-
-    def __init__(self, descriptor: int, most_bytes: float) -> None:
-        super().__init__(descriptor, "w", closefd=False)
-        self._room = most_bytes
-
-    def write(self, data: Any, /) -> int:
-        size = memoryview(data).nbytes
-        if self._room <= 0:
-            return size
-        self._room -= size
-        try:
-            written = super().write(data)
-            if self._room <= 0:
-                super().write(b"\nthis log is full: what comes later is left out\n")
-        except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-                raise
-            return size
-        return written
-
-
-def leave_out_what_has_no_room(name: str, most_bytes: float = math.inf) -> None:
-    """Let ``sys.stdout`` or ``sys.stderr`` write as before, but never fail for want of room."""
-    stream = getattr(sys, name)
-    log = _Log(stream.fileno(), most_bytes)
-    is_raw = isinstance(stream.buffer, io.RawIOBase)
-    made = io.TextIOWrapper(
-        log if is_raw else io.BufferedWriter(log),
-        stream.encoding,
-        stream.errors,
-        line_buffering=stream.line_buffering,
-        write_through=stream.write_through,
-    )
-    setattr(sys, name, made)
-    setattr(sys, f"__{name}__", made)
 
 
 def write_whole(path: Path, data: bytes) -> None:

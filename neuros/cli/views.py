@@ -12,11 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from neuros.ordinary_files import leave_out_what_has_no_room
-
 _LAST_LOG_BYTES = 1 << 16
-MOST_LOG_BYTES = 1 << 16
-"""Of ``dashboard.log``."""
 
 
 def add_view(view: argparse.ArgumentParser) -> None:
@@ -57,8 +53,6 @@ def add_dashboard(dashboard: argparse.ArgumentParser) -> None:
 
 
 def _run_dashboard(_: argparse.Namespace) -> int:
-    # Anybody on this machine can make requests that are worth a line.
-    leave_out_what_has_no_room("stderr", MOST_LOG_BYTES)
     told = json.loads(sys.stdin.readline())
     listening = socket.socket(fileno=told["descriptor"])
     if not _is_looked_at(listening):

@@ -107,7 +107,7 @@ class NodeProcess:
         allow_reading()
         plugins = {file.node.name: str(file.node.plugin) for file in self._files}
         self._tell(control.Hello(tuple(plugins), plugins))
-        with signals_as_socket() as signalled:
+        with signals_as_socket() as (signalled, waker):
             thread = ControlThread(self._link, signalled, self, self._steps)
             thread.start()
             self._guard(self._live)
@@ -119,7 +119,7 @@ class NodeProcess:
             self._guard(self._peers.close)
             if self._middleware is not None:
                 self._guard(self._middleware.flush)
-            thread.end()
+            thread.end(waker)
         return 1 if self._has_failed else 0
 
     # ------------------------------------------------------------------ called by the supervisor
@@ -517,14 +517,17 @@ class ControlThread(threading.Thread):
                     next_report_s = time.monotonic() + _REPORT_S
                     self._try(self._process.report)
 
-    def end(self) -> None:
-        """Report no more."""
+    def end(self, waker: socket.socket) -> None:
+        """End the thread: while it lives, Python does not close what plugins have left open."""
         self._ended.set()
+        waker.send(b"\0")
+        self.join(_REPORT_S)
 
     def _on_signal(self) -> bool:
         with contextlib.suppress(OSError):
             self._signalled.recv(64)
-            self._process.ask_to_stop()
+            if not self._ended.is_set():
+                self._process.ask_to_stop()
         return True
 
     def _on_messages(self) -> bool:
@@ -558,8 +561,8 @@ class ControlThread(threading.Thread):
 
 
 @contextlib.contextmanager
-def signals_as_socket() -> Iterator[socket.socket]:
-    """A socket that becomes readable on SIGTERM or SIGINT, also during a wait in C++."""
+def signals_as_socket() -> Iterator[tuple[socket.socket, socket.socket]]:
+    """A socket that becomes readable on SIGTERM or SIGINT, also during a wait in C++; its peer."""
     reader, writer = socket.socketpair()
     writer.setblocking(False)
     reader.setblocking(False)
@@ -567,7 +570,7 @@ def signals_as_socket() -> Iterator[socket.socket]:
         signal.signal(number, lambda *_: None)
     previous = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     try:
-        yield reader
+        yield reader, writer
     finally:
         signal.set_wakeup_fd(previous)
         reader.close()

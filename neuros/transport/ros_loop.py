@@ -216,6 +216,8 @@ class RosLoop:
     def close(self) -> None:
         """Give up the executor."""
         self._executor.shutdown(0)
+        # It is of C++, and keeps callbacks, and so the loop, from being collected as garbage.
+        del self._executor
 
     def _wake(self) -> None:
         self._waker.wake(None)

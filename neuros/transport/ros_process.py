@@ -37,7 +37,7 @@ from neuros.transport.lean_node import (
 )
 from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import RosPackets
-from neuros.transport.rclpy_patches import do_without_code_generator
+from neuros.transport.rclpy_patches import do_without_code_generator, keep_to_the_end
 from neuros.transport.ros import RosTransport
 from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
@@ -62,10 +62,6 @@ class RosProcess:
     ``digests``: in memory, too, where a packet is serialised only for that; where all connections
     are lossless they are kept unasked, if that is cheap. ``record``: at least those that tell which
     packets have arrived where some may be lost; the packets themselves are in the bag.
-
-    Attributes:
-        has_leftovers: whether :meth:`close` has left ROS as it was. Python would destroy it at its
-            own end, so the process has to leave without that (``os._exit``).
     """
 
     def __init__(
@@ -78,7 +74,6 @@ class RosProcess:
         record: bool = False,
         debug: bool = False,
     ) -> None:
-        self.has_leftovers = False
         self._files = files
         os.environ.update(dds_environment(os.environ))
         self._context = rclpy.Context()
@@ -157,16 +152,16 @@ class RosProcess:
         self.loop.run_for(_LINGER_S)
 
     def close(self) -> None:
-        """Give up everything, but for ROS itself in a crowd.
+        """Give up everything; in a crowd ROS goes with the process.
 
         Others in that crowd notice after 20 s that a process has gone, as with one that was
         killed; the shared memory of DDS is left to the reaper.
         """
-        self.has_leftovers = self._is_in_a_crowd()
-        if self.has_leftovers:
-            return
         self.loop.close()
-        give_up(self._context, self._ros_nodes.values())
+        if self._is_in_a_crowd():
+            keep_to_the_end(self._ros_nodes.values())
+        else:
+            give_up(self._context, self._ros_nodes.values())
 
     def _is_in_a_crowd(self) -> bool:
         """Whether many nodes of other processes are in the domain."""

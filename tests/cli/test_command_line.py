@@ -348,33 +348,6 @@ def test_ctrl_c_without_a_run_is_no_traceback(
     assert main(["validate", "."]) == 130
 
 
-PRINTS = """
-import sys
-from neuros.ordinary_files import leave_out_what_has_no_room
-for name in ("stdout", "stderr"):
-    leave_out_what_has_no_room(name)
-    print("said on", name, file=getattr(sys, name))
-    getattr(sys, name).flush()
-"""
-
-
-@pytest.mark.parametrize("unbuffered", ["", "1"])
-@pytest.mark.parametrize(("log", "is_full"), [("/dev/full", True), ("log", False)])
-def test_where_the_disk_is_full_a_node_prints_into_the_void(
-    log: str, is_full: bool, unbuffered: str
-) -> None:
-    with open(log, "ab") as file:
-        process = subprocess.run(
-            [sys.executable, "-c", PRINTS],
-            stdout=file,
-            stderr=file,
-            env={**os.environ, "PYTHONUNBUFFERED": unbuffered},
-            check=False,
-        )
-    assert process.returncode == 0
-    assert is_full or Path(log).read_text() == "said on stdout\nsaid on stderr\n"
-
-
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 @pytest.mark.parametrize("words", ["--version", "ps --help", "ps", "graph PROJECT"])
 def test_output_that_has_no_room_is_an_error_without_a_traceback(

@@ -159,26 +159,6 @@ def test_a_node_ends_as_a_python_program_ends(bench: Bench) -> None:
     assert (folder / "at exit").exists()
 
 
-HANGS_IN_ROS = """
-import ctypes
-import neuros.transport.ros_process
-@neuros_initialise()
-def spoil(node):
-    neuros.transport.ros_process.give_up = lambda *_: ctypes.PyDLL(None).pause()  # with the GIL
-"""
-
-
-def test_a_process_that_cannot_leave_ros_ends_without_that(bench: Bench) -> None:
-    bench.project(a=WRITES + RUNS + HANGS_IN_ROS, b=RUNS)
-    finished = bench.launch("--duration", "0.2")
-    assert_ended(finished, 0, "0.2 s are over")
-    told = r"the process of nodes? .* ended badly after its final report: killed by SIGALRM"
-    assert len(re.findall(told, finished.output)) == 1
-    assert finished.run_folder is not None
-    assert (finished.run_folder / "a" / "user data").read_text().endswith("999\n")
-    assert (finished.run_folder / "a" / "at exit").exists()
-
-
 FORKS = """
 import atexit, os
 @neuros_tick(seconds=0.02, outputs="o")

@@ -59,15 +59,3 @@ def test_what_is_not_understood_fails_in_the_loop() -> None:
     (fail,) = process.events
     with pytest.raises(ControlError, match="the supervisor sent a control message of the unknown"):
         fail()
-
-
-def test_a_node_may_have_failed_and_closed_all_before_the_thread_begins() -> None:
-    process: Any = Process()
-    ours, theirs = socket.socketpair()
-    signalled, signaller = socket.socketpair()
-    with theirs, signaller:
-        with ours, signalled:
-            thread = ControlThread(ControlLink(ours, TO_NODES, "x"), signalled, process)
-        thread.end()
-        thread.run()
-    assert process.obeyed == process.events == []

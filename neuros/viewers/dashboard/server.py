@@ -106,7 +106,7 @@ class Dashboard:
         """Answer requests until the supervisor hangs up."""
         config = uvicorn.Config(
             self.app(token, run),
-            log_level="warning",
+            log_level="error",  # anybody on this machine can make requests that are worth a warning
             access_log=False,
             lifespan="off",
             timeout_graceful_shutdown=_CLOSING_S,
