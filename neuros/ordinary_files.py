@@ -1,7 +1,7 @@
-"""Files in folders that others may write to, as nodes may to the run folder.
+"""Files in folders that others may write to, as nodes in containers may to the run folder.
 
-There, a link would have us change a file elsewhere, and a pipe would have us wait for ever. So what
-is written takes the place of whatever has its name, and only ordinary files are read.
+There, a link would have us change a file of the user elsewhere: what is written goes to a new file
+that takes the name, or is not written.
 """
 
 from __future__ import annotations
@@ -16,9 +16,6 @@ from pathlib import Path
 from typing import BinaryIO
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-_APPEND = os.O_WRONLY | os.O_APPEND | os.O_NOFOLLOW | os.O_CLOEXEC
-# What opening says of a file that is not there, of a link, and of a pipe that nobody reads.
-_NO_FILE = (errno.ENOENT, errno.ELOOP, errno.ENXIO)
 
 
 def open_ordinary(path: Path) -> BinaryIO:
@@ -26,15 +23,10 @@ def open_ordinary(path: Path) -> BinaryIO:
     return open(path, "rb", opener=lambda *_: descriptor_of(path))
 
 
-def open_itself(path: Path) -> BinaryIO:
-    """As :func:`open_ordinary`. Raises ``OSError``: also if it is a link."""
-    return open(path, "rb", opener=lambda *_: descriptor_of(path, os.O_NOFOLLOW))
-
-
 def descriptor_of(path: Path, flags: int = 0) -> int:
     """As :func:`open_ordinary`, without a buffer; ``flags``: more of those of ``os.open``."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | flags)
-    if _is_ordinary(descriptor):
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return descriptor
     os.close(descriptor)
     if path.is_dir():
@@ -45,25 +37,12 @@ def descriptor_of(path: Path, flags: int = 0) -> int:
 def open_new(path: Path) -> BinaryIO:
     """Open a new file in the place of what is there. Raises ``OSError``: also for a folder."""
     path.unlink(missing_ok=True)
-    return open(os.open(path, _APPEND | os.O_CREAT | os.O_EXCL, 0o666), "wb")
+    return open(path, "xb")
 
 
 def open_log(path: Path) -> BinaryIO:
-    """Open a file for appending; anything but a file is replaced by a new one.
-
-    Raises ``OSError``: also for a folder.
-    """
-    try:
-        descriptor = os.open(path, _APPEND | os.O_NONBLOCK)
-    except OSError as error:
-        if error.errno not in _NO_FILE:
-            raise
-        return open_new(path)
-    if not _is_ordinary(descriptor):
-        os.close(descriptor)
-        return open_new(path)
-    os.set_blocking(descriptor, True)
-    return open(descriptor, "ab")
+    """Open a file for appending. Raises ``OSError``: also for a link."""
+    return open(path, "ab", opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW, 0o666))
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -139,7 +118,3 @@ def cannot_be_opened(error: OSError) -> str:
     with contextlib.suppress(KeyError):
         return f"{text}: {what} {place}, which belongs to {pwd.getpwuid(user).pw_name}"
     return f"{text}: {what} {place}, which belongs to user {user}"
-
-
-def _is_ordinary(descriptor: int) -> bool:
-    return stat.S_ISREG(os.fstat(descriptor).st_mode)

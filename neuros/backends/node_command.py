@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
-from neuros.ordinary_files import open_ordinary
 from neuros.ports import NodeProgram
 from neuros.project.model import Node, NodeFile
 
@@ -233,7 +232,7 @@ def signal_in_words(number: int) -> str:
 
 def last_line(log: Path) -> str:
     """The last line of a log, empty if there is none."""
-    with contextlib.suppress(OSError), open_ordinary(log) as file:
+    with contextlib.suppress(OSError), open(log, "rb") as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL_BYTES))
         lines = file.read().decode(errors="replace").splitlines()
         return lines[-1] if lines else ""

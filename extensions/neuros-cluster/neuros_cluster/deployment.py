@@ -23,7 +23,6 @@ from neuros.backends.node_command import moved
 from neuros.control import CONTROL_VARIABLE
 from neuros.distribution import WORKSPACE
 from neuros.errors import EnvironmentFault, results_of
-from neuros.ordinary_files import open_itself
 from neuros.ports import (
     Deployment,
     DeploymentKind,
@@ -350,13 +349,12 @@ def _texts(run: Path) -> dict[str, str]:
     """What lies in a run folder before the nodes start: the project, the plan of the recording.
 
     Raises:
-        EnvironmentFault: if something there cannot be read, or is a link.
+        EnvironmentFault: if something there cannot be read.
     """
     found = {}
     for path in run.glob("*.json"):
         try:
-            with open_itself(path) as file:
-                found[path.name] = file.read().decode("utf-8")
+            found[path.name] = path.read_text("utf-8")
         except (OSError, UnicodeDecodeError) as error:
             why = getattr(error, "strerror", None) or error
             raise EnvironmentFault(

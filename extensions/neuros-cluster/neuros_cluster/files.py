@@ -34,7 +34,7 @@ from pathlib import Path
 
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.errors import EnvironmentFault
-from neuros.ordinary_files import folder_in, open_itself, open_log
+from neuros.ordinary_files import folder_in, open_log
 from neuros_cluster.messages import Chunk, Tree, TreeFile
 
 RECEIVED, RUNS = "received", "runs"
@@ -243,16 +243,14 @@ class Follower:
                     yield from self._news(path)
 
     def _news(self, path: Path) -> Iterator[Chunk]:
-        """What an ordinary file has beyond what was sent of it; it may have become shorter."""
+        """What a file has beyond what was sent of it; it may have become shorter."""
         relative = path.relative_to(self._run)
         name = relative.as_posix()
         if relative.parts[0] not in self._nodes:
             name = f"{MACHINES}/{self._machine}/{name}"
-        with (
-            contextlib.suppress(OSError),
-            folder_in(self._run, *relative.parent.parts) as folder,
-            open_itself(folder / path.name) as file,
-        ):
+        if not path.is_file():  # a pipe, say, through which a plugin speaks with its programs
+            return
+        with contextlib.suppress(OSError), open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
             sent = self._sent.get(name, 0)
             if name not in self._sent or size < sent:
@@ -266,10 +264,7 @@ class Follower:
 
 
 def write_chunk(run: Path, chunk: Chunk) -> int:
-    """Write a part of a file into a run folder; returns its length. Raises ``OSError``.
-
-    A link or a pipe in the place of the file is replaced by a file.
-    """
+    """Write a part of a file into a run folder; returns its length. Raises ``OSError``."""
     path = Path(os.path.normpath(run / chunk.path))
     if path == run or not path.is_relative_to(run):
         raise OSError(f"{chunk.path} is outside of the run folder")

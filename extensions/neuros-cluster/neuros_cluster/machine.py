@@ -25,7 +25,7 @@ from neuros.control import FROM_NODES, Message, NodeStatus, Probed, Report
 from neuros.control.link import decode, encode, kind_of
 from neuros.distribution import WORKSPACE, __version__
 from neuros.errors import ControlError, EnvironmentFault
-from neuros.ordinary_files import folder_in, open_itself, reason_of, write_whole
+from neuros.ordinary_files import reason_of, write_whole
 from neuros.ports import ControlStream
 from neuros.project.model import Folders
 from neuros.stacks import ProcessThreads
@@ -216,10 +216,7 @@ class Machine:
             return
         for node in nodes:
             try:
-                with folder_in(self._run, node, _PACKET_LOG) as folder:
-                    self.clock.log_here(folder)
-            except FileNotFoundError:  # it has no packet log
-                continue
+                self.clock.log_here(self._run / node / _PACKET_LOG)
             except OSError as error:
                 why = f"the packet log of {node} cannot be moved: {reason_of(error)}"
                 self.fault = self.fault or why
@@ -499,8 +496,7 @@ class ClockOffset:
             what = next((part for part in file.name.split(".") if part in _TIMES), "")
             width, columns = _TIMES.get(what, (1, ()))
             if columns:
-                with open_itself(file) as written:
-                    data = written.read()
+                data = file.read_bytes()
                 entries = np.frombuffer(data[: len(data) // 8 * 8], np.int64).copy()
                 for column in columns:
                     times = entries[column::width]
