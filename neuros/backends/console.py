@@ -12,7 +12,6 @@ import math
 import os
 import re
 import select
-import stat
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -20,7 +19,6 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TextIO
 
 from neuros.control import Report
-from neuros.ordinary_files import descriptor_of
 
 LAYOUT = "[{severity}] [{time}] [{name}]: {message}"
 """What ROS 2 prints unless ``RCUTILS_CONSOLE_OUTPUT_FORMAT`` says otherwise."""
@@ -32,15 +30,11 @@ _RESET = "\x1b[0m"
 _NODE_COLOURS = ("36", "32", "35", "34", "96", "92", "95", "94")
 _SEVERITY_COLOURS = {"DEBUG": "2", "WARN": "33", "ERROR": "31", "FATAL": "1;31"}
 
-# ECMA-48: control sequences, of which SGR ("...m") sets colours; then strings such as window
-# titles, which end with BEL or ST; then all other escape sequences.
-_ESCAPE = re.compile(
-    r"\x1b\[(?P<sgr>[0-9;:]*)m"
-    r"|(?:\x1b\[|\x9b)[0-?]*[ -/]*[@-~]"
-    r"|(?:\x1b[\]PX^_]|[\x90\x98\x9d-\x9f])[^\x07\x1b\x9c]*(?:\x07|\x1b\\|\x9c)?"
-    r"|\x1b[ -/]*[0-~]?"
+# Colours, then all other control sequences of ECMA-48, then control characters.
+_CONTROL = re.compile(
+    r"(?P<colour>\x1b\[[0-9;:]*m)|(?P<sequence>\x1b\[[0-?]*[ -/]*[@-~])"
+    r"|[\x00-\x08\x0a-\x1f\x7f-\x9f\u2028\u2029]"
 )
-_CONTROL = re.compile(r"[\x00-\x08\x0a-\x1a\x1c-\x1f\x7f-\x9f\u2028\u2029]|\x1b(?!\[[0-9;:]*m)")
 _READ_BYTES = 1 << 16
 _LONGEST_LINE_BYTES = 1 << 16
 _MOST_BEHIND_BYTES = 1 << 22
@@ -161,7 +155,7 @@ class _GrowingFile:
         self._descriptor: int | None = None
         self._rest = b""
         self._last_time_ns = 0
-        self._is_closed = self._is_refused = False
+        self._is_closed = False
 
     def time_of(self, line: bytes) -> int:
         """Unix time of a line in ns, never before that of the lines above it in the file."""
@@ -211,22 +205,13 @@ class _GrowingFile:
     def _read(self) -> bytes:
         if self._is_closed:
             return b""
-        if self._descriptor is None:
-            try:
-                self._descriptor = descriptor_of(self._path, os.O_NOFOLLOW)
-            except OSError:
-                return self._refusal()
-            if self._last_bytes is not None:
-                size = os.fstat(self._descriptor).st_size
-                os.lseek(self._descriptor, max(0, size - self._last_bytes), os.SEEK_SET)
-        return os.read(self._descriptor, _READ_BYTES)
-
-    def _refusal(self) -> bytes:
-        """Once, the line that says that what is there is no file; else nothing."""
-        with contextlib.suppress(OSError):
-            if not self._is_refused and not stat.S_ISREG(os.lstat(self._path).st_mode):
-                self._is_refused = True
-                return f"({self._path} is not shown: it is not an ordinary file)\n".encode()
+        with contextlib.suppress(OSError):  # it is not there yet, or no file
+            if self._descriptor is None:
+                self._descriptor = os.open(self._path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+                if self._last_bytes is not None:
+                    size = os.fstat(self._descriptor).st_size
+                    os.lseek(self._descriptor, max(0, size - self._last_bytes), os.SEEK_SET)
+            return os.read(self._descriptor, _READ_BYTES)
         return b""
 
 
@@ -239,7 +224,7 @@ class _Painter:
     def paint(self, name: str, line: bytes) -> str:
         text = clean(line.decode("utf-8", "backslashreplace"), keep_colours=bool(self._palette))
         record = _RECORD.search(text) if "] [" in text else None
-        if record is None or _ESCAPE.sub("", text[: record.start()]):
+        if record is None or _CONTROL.sub("", text[: record.start()]):
             return self._coloured(name, f"[{name}] {text}")
         # A process may write records of any of its nodes.
         owner = record["name"] if record["name"] in self._palette else name
@@ -258,16 +243,19 @@ class _Painter:
 def clean(text: str, *, keep_colours: bool) -> str:
     r"""One line without what could do something to a terminal.
 
-    Escape sequences go, except colours if they are to stay; other control characters are shown as
-    ``\x07``. Of a line that was overwritten with carriage returns, the last version stays.
+    Control sequences go, except colours if they are to stay; other control characters are shown,
+    as ``\x07``. Of a line that was overwritten with carriage returns, the last version stays.
     """
     if text.isprintable():
         return text
     text = text.rstrip("\r").rpartition("\r")[2]
-    text = _ESCAPE.sub(
-        lambda match: match[0] if keep_colours and match["sgr"] is not None else "", text
-    )
-    return _CONTROL.sub(lambda match: f"\\x{ord(match[0]):02x}", text)
+
+    def shown(match: re.Match[str]) -> str:
+        if match.lastgroup is None:
+            return f"\\x{ord(match[0]):02x}"
+        return match[0] if keep_colours and match["colour"] else ""
+
+    return _CONTROL.sub(shown, text)
 
 
 class NonBlockingWriter:
@@ -421,10 +409,13 @@ class Progress:
         now = self._read()
         if now is None:
             return ""
-        share = self._share(now)
+        if self._wall_s is not None:
+            share = min(1.0, self._elapsed_s(now) / self._wall_s)
+        elif self._end_sim_s is not None and now.sim_s is not None:
+            share = min(1.0, now.sim_s / self._end_sim_s)
+        else:
+            return self.text()[: columns - 1]
         parts = [self._how_far(now), *self._figures(now)]
-        if share is None:
-            return ", ".join(parts)[: columns - 1]
         while len(parts) > 2 and len(", ".join(parts)) > columns - _BESIDE_TEXT:
             del parts[-2]  # the last is the time that is left
         text = ", ".join(parts)
@@ -494,12 +485,6 @@ class Progress:
         if end_s is None or now.sim_s is None or not factor:
             return None
         return max(0.0, (end_s - now.sim_s) / factor)
-
-    def _share(self, now: _Reading) -> float | None:
-        if self._wall_s is not None:
-            return min(1.0, self._elapsed_s(now) / self._wall_s)
-        end_s = self._end_sim_s
-        return None if end_s is None or now.sim_s is None else min(1.0, now.sim_s / end_s)
 
     def _elapsed_s(self, now: _Reading) -> float:
         return now.wall_s - (self._outcome.started_s or now.wall_s)
