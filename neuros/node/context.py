@@ -10,16 +10,13 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping, Sequence
-from importlib.machinery import ModuleSpec
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 # Below a project's folder there may be a virtual environment, or NeuROS itself: all share those.
 _SHARED = (str(Path(sys.prefix)) + os.sep, str(Path(__file__).resolve().parents[1]) + os.sep)
-
-
 # Libraries whose state belongs to the whole process, so that one node at most can use them.
 _FOR_ONE_NODE = {"nest": "NEST has one kernel per process"}
 
@@ -66,14 +63,18 @@ class Context:
 
 
 class ContextSwitch:
-    """Puts the context of one node at a time in place."""
+    """Puts the context of one node at a time in place.
+
+    On ``sys.meta_path`` it refuses to import a library that another node has for itself.
+    """
 
     def __init__(self) -> None:
-        self._process = Context({}, _environ_data(), sys.path)
+        self._process = Context({}, os.environ._data, sys.path)  # type: ignore[attr-defined]
         self._current = self._process
         self._known_modules = len(sys.modules)
-        self._owned: dict[str, _Owned] = {}
-        self._changes: dict[tuple[Context, Context], _Changes] = {}
+        self._owners: dict[str, Context] = {}
+        # By the contexts before and after a switch, the variables in which nodes differ.
+        self._differing: dict[tuple[Context, Context], list[Any]] = {}
 
     def make_context(
         self,
@@ -91,12 +92,16 @@ class ContextSwitch:
             project: modules from below this folder are private to the node.
             log_file: where its standard output and error go, ``None`` to leave them.
         """
+        log_fd = None
+        if log_file is not None:
+            log_file.parent.mkdir(parents=True, exist_ok=True)
+            log_fd = os.open(log_file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         return Context(
             environment,
             self._environ_with(environment),
             [*([str(plugin.parent)] if plugin else []), *self._process.path],
             str(project) + os.sep,
-            None if log_file is None else _open_log(log_file),
+            log_fd,
         )
 
     def enter(self, context: Context) -> None:
@@ -114,12 +119,7 @@ class ContextSwitch:
         # Within os.environ itself, so that other references to it show these, too.
         os.environ._data = context.environ  # type: ignore[attr-defined]
         current.path, sys.path = sys.path, context.path
-        if context.modules:
-            modules.update(context.modules)
-        for owned in self._owned.values():
-            is_visible = context is owned.owner or context is self._process
-            if is_visible is not owned.is_visible:
-                owned.show(is_visible=is_visible)
+        modules.update(context.modules)
         self._known_modules = len(modules)
         if context.log_fd is not None:
             os.dup2(context.log_fd, 1)
@@ -135,7 +135,7 @@ class ContextSwitch:
 
     def why_bound(self, context: Context) -> str:
         """Which library holds state of this node outside of its modules; empty if none does."""
-        names = [each.name for each in self._owned.values() if each.owner is context]
+        names = [name for name, owner in self._owners.items() if owner is context]
         if not names:
             return ""
         return f"a plugin has imported {names[0]}, which keeps its state for the whole process"
@@ -148,7 +148,7 @@ class ContextSwitch:
         It is not in place afterwards. ``forgets_modules``: those of the node are imported anew.
         """
         self.leave()
-        self._changes.clear()
+        self._differing.clear()
         context.variables = dict(environment)
         context.environ = self._environ_with(environment)
         if forgets_modules:
@@ -165,92 +165,39 @@ class ContextSwitch:
             environ[os.environ.encodekey(key)] = os.environ.encodevalue(value)
         return environ
 
+    def find_spec(self, name: str, *_: object) -> None:
+        """Part of the import system: refuse a library that another node has for itself."""
+        owner = self._owners.get(name)
+        if owner is not None and self._current not in (owner, self._process):
+            raise ImportError(
+                f"{_FOR_ONE_NODE[name]}, and another node of this process uses it: run the project"
+                " with --backend process"
+            )
+
     def _find_modules(self, context: Context) -> None:
         """Note which modules of the process are private to a node."""
         for name, module in tuple(sys.modules.items()):
             if context.hides(module):
                 context.modules[name] = module
-        self._note_owned(context)
+        for name in _FOR_ONE_NODE:
+            if name in sys.modules and name not in self._owners and context is not self._process:
+                self._owners[name] = context
+                context.modules[name] = self._process.modules[name] = sys.modules[name]
+                if self not in sys.meta_path:
+                    sys.meta_path.insert(0, self)
 
     def _set_variables(self, old: Context, new: Context) -> None:
         """Let C libraries see the variables that differ (``getenv``)."""
-        changes = self._changes.get((old, new))
-        if changes is None:
-            changes = self._changes[old, new] = _Changes(old, new)
-        for key in changes.gone:
+        keys = self._differing.get((old, new))
+        if keys is None:
+            keys = self._differing[old, new] = [
+                os.environ.encodekey(name)
+                for name in {**old.variables, **new.variables}
+                if old.variables.get(name) != new.variables.get(name)
+            ]
+        for key in keys:
             value = new.environ.get(key)
             if value is None:
                 os.unsetenv(key)
             else:
                 os.putenv(key, value)
-        for key, value in changes.new:
-            os.putenv(key, value)
-
-    def _note_owned(self, context: Context) -> None:
-        for name in _FOR_ONE_NODE:
-            module = sys.modules.get(name)
-            if module is not None and name not in self._owned and context is not self._process:
-                self._owned[name] = _Owned(name, module, context)
-
-
-class _Changes:
-    """Which variables differ between two contexts, encoded: looked up once, needed at each switch.
-
-    Attributes:
-        gone: those that the new context has not as a node, though perhaps as the process.
-        new: the values of those that it has, and that are other ones than before.
-    """
-
-    def __init__(self, old: Context, new: Context) -> None:
-        key, value = os.environ.encodekey, os.environ.encodevalue
-        self.gone = [key(name) for name in old.variables if name not in new.variables]
-        self.new = [
-            (key(name), value(text))
-            for name, text in new.variables.items()
-            if old.variables.get(name) != text
-        ]
-
-
-class _Owned:
-    """A library that one node has imported, hidden from and refused to the others.
-
-    It is a finder on ``sys.meta_path`` (``importlib.abc`` would cost 10 ms at the start).
-    """
-
-    def __init__(self, name: str, module: ModuleType, owner: Context) -> None:
-        self.name, self.module, self.owner = name, module, owner
-        self.is_visible = True
-
-    def show(self, *, is_visible: bool) -> None:
-        """Let it be imported now, or not."""
-        self.is_visible = is_visible
-        if is_visible:
-            sys.modules[self.name] = self.module
-            if self in sys.meta_path:
-                sys.meta_path.remove(self)
-        else:
-            sys.modules.pop(self.name, None)
-            if self not in sys.meta_path:
-                sys.meta_path.insert(0, self)
-
-    def find_spec(
-        self,
-        fullname: str,
-        path: Sequence[str] | None,
-        target: ModuleType | None = None,
-    ) -> ModuleSpec | None:
-        if fullname != self.name:
-            return None
-        raise ImportError(
-            f"{_FOR_ONE_NODE[fullname]}, and another node of this process uses it: run the project"
-            " with --backend process"
-        )
-
-
-def _open_log(path: Path) -> int:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
-
-
-def _environ_data() -> dict[Any, Any]:
-    return os.environ._data  # type: ignore[attr-defined,no-any-return]
