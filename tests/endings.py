@@ -6,7 +6,7 @@ import contextlib
 import fcntl
 from pathlib import Path
 
-from neuros.backends.shared_memory import _holders
+from neuros.backends.shared_memory import _are_held
 
 GONE_WITHIN_S = 6.0
 RUNS = """
@@ -24,8 +24,8 @@ def dead_shared_memory(since_s: float) -> list[str]:
 
     Not LTTng's: there is one per user, which the nodes of other tests make and give up meanwhile.
     """
-    groups = _holders(Path("/dev/shm"), since_s)
-    names = [name for files, holders in groups.items() if not holders for name, _ in files]
+    groups = _are_held(Path("/dev/shm"), since_s)
+    names = [name for files, is_held in groups.items() if not is_held for name, _ in files]
     return [name for name in names if not name.startswith("lttng-")]
 
 

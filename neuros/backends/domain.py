@@ -11,9 +11,8 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-import stat
 import tempfile
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from neuros.backends.reaper_program import is_same_file, remove_lock
@@ -73,14 +72,19 @@ def choose_domain(
     all users of the machine share. Raises ``UsageError`` for an id that is none, and
     ``EnvironmentFault`` if all domains are taken.
     """
-    folder = folder or _shared_folder()
+    if folder is None:  # not TMPDIR, which may differ from user to user
+        shared = Path("/tmp")
+        folder = shared if os.access(shared, os.W_OK | os.X_OK) else Path(tempfile.gettempdir())
     if (given := given_domain(explicit, environ)) is not None:
         return _told(given, "ROS_DOMAIN_ID" if explicit is None else "-d", folder)
     if has_external_topics_or_partial:
         return _told(0, "default, where other ROS nodes are", folder)
     ports = _udp_ports()
     for domain in AUTOMATIC:
-        if _is_used_without_lock(domain, ports):
+        # Another program may have a DDS participant there (DDSI-RTPS 2.5, 9.6.2): discovery is on
+        # port 7400 + 250 x domain, then each participant has two more, from + 10 on.
+        base = 7400 + 250 * domain
+        if any(base <= port < base + 76 for port in ports):
             continue
         if lock := _lock(folder, domain, fcntl.LOCK_EX):
             return DomainLock(domain, "first free", lock)
@@ -142,11 +146,7 @@ def _open(path: Path) -> int | None:
     flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
         # Linux refuses O_CREAT on another user's file in a shared folder (fs.protected_regular).
-        descriptor = os.open(path, flags)
-        if stat.S_ISREG(os.fstat(descriptor).st_mode):
-            return descriptor
-        os.close(descriptor)
-        return None
+        return os.open(path, flags)
     except FileNotFoundError:
         pass
     except OSError:
@@ -163,21 +163,6 @@ def _open(path: Path) -> int | None:
         ) from error
     os.fchmod(descriptor, 0o666)  # whatever the umask: all users take part
     return descriptor
-
-
-def _shared_folder() -> Path:
-    # Not TMPDIR, which may differ from user to user.
-    shared = Path("/tmp")
-    return shared if os.access(shared, os.W_OK | os.X_OK) else Path(tempfile.gettempdir())
-
-
-def _is_used_without_lock(domain: int, udp_ports: Collection[int]) -> bool:
-    """Whether a DDS participant is there that is none of ours (DDSI-RTPS 2.5, 9.6.2).
-
-    Discovery multicast is on 7400 + 250 x domain, unicast on + 10 + 2 x participant, + 1 for data.
-    """
-    base = 7400 + 250 * domain
-    return any(base <= port < base + 76 for port in udp_ports)
 
 
 def _udp_ports() -> set[int]:

@@ -214,9 +214,8 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
 
     from pathlib import Path
 
-    from neuros.backends.shared_memory import remove_dead_runs, remove_segments, sweep
+    from neuros.backends.shared_memory import remove_dead_runs, sweep
 
-    remove_segments(run_id)
     sweep(orders.started_s)
     _remove(orders.paths)
     for descriptor, path in orders.locks:

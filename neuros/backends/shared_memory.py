@@ -51,24 +51,7 @@ _CLOCK_SLACK_S = 0.05
 _NAME = re.compile(r"neuros_(?P<run>[0-9a-f]{16})(?:_.*)?")
 _LOOK_AGAIN_S = 0.1
 _MOST_LOOKS = 20
-_UNSEEN = 0  # the holder of a lock in another container, or of another user
 _Files: TypeAlias = "tuple[tuple[str, int], ...]"  # names and inodes: they live and die together
-
-
-def remove_segments(run_id: str, *, folder: Path = Path("/dev/shm")) -> tuple[str, ...]:
-    """Remove what a run, none of whose processes is left, had in shared memory for large packets.
-
-    Returns the names removed.
-    """
-    mine: list[tuple[str, int]] = []
-    with contextlib.suppress(FileNotFoundError):
-        for name in os.listdir(folder):
-            if name.startswith(f"neuros_{run_id}_"):
-                with contextlib.suppress(FileNotFoundError):
-                    status = os.lstat(folder / name)
-                    if status.st_uid == os.getuid():
-                        mine.append((name, status.st_ino))
-    return tuple(_remove(folder, mine))
 
 
 def sweep(
@@ -77,27 +60,21 @@ def sweep(
     """Remove what dead nodes of this user left since ``started_s`` (Unix time, seconds).
 
     Looks every ``look_again_s``, and removes what nobody holds in two looks in a row: a node that
-    is just starting makes its files a moment before it locks them. What the same process holds
-    twice in a row is alive. A holder that changes is no owner: other sweeps, and Fast DDS in the
-    neighbours, lock files for a moment to see whether they can. Returns the names removed.
+    is just starting makes its files a moment before it locks them. What is held three times in a
+    row is alive: other sweeps, and Fast DDS in the neighbours, lock files for a moment to see
+    whether they can. Returns the names removed.
     """
     removed: list[str] = []
-    before = _holders(folder, started_s)
-    for _ in range(_MOST_LOOKS):
-        if not before:
-            break
+    looks: list[dict[_Files, bool]] = [_are_held(folder, started_s)]
+    while looks[-1] and len(looks) < _MOST_LOOKS:
         time.sleep(look_again_s)
-        now = {
-            files: held for files, held in _holders(folder, started_s).items() if files in before
-        }
-        for files, held in now.items():
-            if not held and not before[files]:
-                removed += _remove(folder, files)
-        before = {
-            files: held
-            for files, held in now.items()
-            if held != before[files] and held.isdisjoint(before[files])
-        }
+        now = _are_held(folder, started_s)
+        for files in [each for each in now if not now[each] and looks[-1].get(each) is False]:
+            removed += _remove(folder, files)
+            del now[files]
+        looks.append(now)
+        if all(look.get(files) for files in now for look in looks[-3:]) and len(looks) >= 3:
+            break
     return tuple(removed)
 
 
@@ -106,25 +83,23 @@ class _Found(NamedTuple):  # a dataclass would take the reaper 10 ms to import
     locks: list[str]
 
 
-def _holders(folder: Path, started_s: float) -> dict[_Files, set[int]]:
-    """Who holds each group of files: process ids, :data:`_UNSEEN` for one that cannot be seen."""
-    fresh = [
-        group
-        for base, group in _groups(folder).items()
-        if _is_ours(group.files.values(), started_s if not _LTTNG.fullmatch(base) else 0.0)
-    ]
-    used = _users(folder, {name for group in fresh if not group.locks for name in group.files})
-    owners = _lock_owners() if any(group.locks for group in fresh) else {}
+def _are_held(folder: Path, started_s: float) -> dict[_Files, bool]:
+    """Whether somebody holds each group of files."""
+    fresh = []
+    for base, group in _groups(folder).items():
+        since_s = 0.0 if _LTTNG.fullmatch(base) else started_s - _CLOCK_SLACK_S
+        files = group.files.values()
+        is_ours = all(file.st_uid == os.getuid() for file in files)
+        if is_ours and any(file.st_mtime >= since_s for file in files):
+            fresh.append(group)
+    mapped = _mapped(folder, {name for group in fresh if not group.locks for name in group.files})
     held = {}
     for group in fresh:
-        files = tuple(sorted((name, stat.st_ino) for name, stat in group.files.items()))
+        key = tuple(sorted((name, stat.st_ino) for name, stat in group.files.items()))
         if group.locks:
-            holders = set().union(*(owners.get(_lock(group.files[n]), ()) for n in group.locks))
-            if not holders and any(_inode_if_free(folder / n) is None for n in group.locks):
-                holders = {_UNSEEN}
+            held[key] = any(_inode_if_free(folder / name) is None for name in group.locks)
         else:
-            holders = set().union(*(used.get(name, ()) for name in group.files))
-        held[files] = holders
+            held[key] = not mapped.isdisjoint(group.files)
     return held
 
 
@@ -144,48 +119,23 @@ def _groups(folder: Path) -> Mapping[str, _Found]:
     return found
 
 
-def _is_ours(stats: Iterable[os.stat_result], started_s: float) -> bool:
-    stats = list(stats)
-    return all(stat.st_uid == os.getuid() for stat in stats) and any(
-        stat.st_mtime >= started_s - _CLOCK_SLACK_S for stat in stats
-    )
+def _mapped(folder: Path, names: Set[str]) -> Set[str]:
+    """Those of ``names`` in ``folder`` that a process has mapped, as far as it can be seen.
 
-
-def _lock(stat: os.stat_result) -> str:
-    """A file as ``/proc/locks`` names it."""
-    return f"{os.major(stat.st_dev):02x}:{os.minor(stat.st_dev):02x}:{stat.st_ino}"
-
-
-def _lock_owners() -> Mapping[str, set[int]]:
-    """The processes, as far as they can be seen, that have a file locked with ``flock``."""
-    owners: dict[str, set[int]] = {}
-    with contextlib.suppress(OSError), open("/proc/locks", encoding="ascii") as locks:
-        for line in locks:  # 1: FLOCK  ADVISORY  WRITE 5301 00:1b:77 0 EOF; "1: -> ..." waits
-            fields = line.split()
-            if fields[1] == "FLOCK":
-                owners.setdefault(fields[5], set()).add(int(fields[4]))
-    return owners
-
-
-def _users(folder: Path, names: Set[str]) -> Mapping[str, set[int]]:
-    """Processes, as far as they can be seen, that have ``names`` in ``folder`` mapped.
-
-    One or more for each name in use: the mappings of all processes are megabytes, and the oldest
-    users are the same in the next look.
+    The mappings of all processes are megabytes: it stops once it has found all names.
     """
-    prefix = f"{folder}/"
-    users: dict[str, set[int]] = {}
-    for pid in sorted(map(int, filter(str.isdigit, os.listdir("/proc")))):
-        if users.keys() >= names:
+    prefix = f"{folder}/".encode()
+    found: set[str] = set()
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        if found >= names:
             break
         # Processes end while we look, and those of other users do not let us in.
         with contextlib.suppress(OSError), open(f"/proc/{pid}/maps", "rb") as maps:
             for line in maps:
-                at = line.find(prefix.encode())
-                if at >= 0:
-                    name = os.fsdecode(line[at + len(prefix) :].rstrip(b"\n"))
-                    users.setdefault(name, set()).add(pid)
-    return users
+                _, is_there, name = line.rstrip(b"\n").partition(prefix)
+                if is_there:
+                    found.add(os.fsdecode(name))
+    return found
 
 
 def _remove(folder: Path, files: Iterable[tuple[str, int]]) -> Iterator[str]:

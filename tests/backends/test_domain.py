@@ -137,11 +137,11 @@ def test_a_link_in_place_of_a_lock_file_is_not_followed(tmp_path: Path) -> None:
 
 def test_a_pipe_in_place_of_a_lock_file_holds_up_nobody(tmp_path: Path) -> None:
     with _first_free(tmp_path) as probe:
-        path, free = probe.path, probe.id
+        path = probe.path
     assert path is not None
     os.mkfifo(path)
     with _first_free(tmp_path) as lock:
-        assert lock.id != free
+        assert lock.path == path
 
 
 def test_without_any_free_domain_the_user_is_told_what_to_do(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ import pytest
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
-from neuros.backends.shared_memory import hold, remove_dead_runs, remove_segments, sweep
+from neuros.backends.shared_memory import hold, remove_dead_runs, sweep
 from neuros.transport.dds_profile import PROFILES_VARIABLE, RANGE_VARIABLE
 from neuros.transport.message_buffers import SegmentWriter
 
@@ -87,16 +87,6 @@ def test_an_owner_that_locks_between_two_looks_is_not_disturbed(
     assert _names(folder) == set(PORT)
 
 
-def test_an_owner_that_cannot_be_seen_is_not_disturbed(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # A container lists the locks of its own processes only.
-    monkeypatch.setattr("neuros.backends.shared_memory._lock_owners", dict)
-    with open(folder / PORT[1]) as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        assert _sweep(folder) == ()
-
-
 def test_without_a_lock_file_it_counts_whether_somebody_maps_the_memory(folder: Path) -> None:
     (folder / PORT[1]).unlink()
     with open(folder / PORT[0], "r+b") as file:
@@ -138,18 +128,7 @@ def test_files_of_other_programs_are_left_alone(tmp_path: Path) -> None:
 
 def test_a_folder_that_does_not_exist_is_clean(tmp_path: Path) -> None:
     assert _sweep(tmp_path / "nowhere") == ()
-    assert remove_segments("abc", folder=tmp_path / "nowhere") == ()
     assert remove(tmp_path / "nowhere") == ()
-
-
-def test_segments_for_large_packets_go_with_the_run_that_their_name_tells(tmp_path: Path) -> None:
-    own = {"neuros_abc_camera_image_1234", "neuros_abc_scanner_scan_5678"}
-    others = {"neuros_abcd_camera_image_1234", "neuros_xyz_camera_image_1", "neuros", "other"}
-    for name in own | others:
-        (tmp_path / name).touch()
-    assert set(remove_segments("abc", folder=tmp_path)) == own
-    assert _names(tmp_path) == others
-    assert _sweep(tmp_path) == ()
 
 
 def test_the_reaper_removes_the_segments_of_its_run() -> None:
