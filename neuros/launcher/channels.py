@@ -1,8 +1,8 @@
 """The supervisor's ends of the control channel: node processes, and observers of the run.
 
 Nothing here ever waits for a node: one that is stopped, or has forked children which keep its
-socket open, must not hold up the supervisor. Nor may other programs, however many there are and
-whatever they say: they are heard for a moment at a time, a limited number at a time.
+socket open, must not hold up the supervisor. Nor may other programs: node processes come first, and
+of each other program what has arrived is read once at a time.
 
 Observers are programs that may pause, step and end a run. They see what nodes show when asked (they
 ask while a user looks), and take no part in the run: when the last one has gone, a run that was
@@ -29,10 +29,6 @@ from neuros.ports import ControlListener
 STRANGER = "an unknown program"
 _MOST_UNSENT_BYTES = 1 << 20
 _READS_AT_A_TIME = 64
-_MOST_OTHERS = 64
-_OTHERS_S = 0.05
-_SILENT_S = 1.0
-_LONGEST_GREETING_BYTES = 1 << 16
 _WAKING_BYTES = 1024
 
 _FIRST_LOOK_S = 0.0005
@@ -57,12 +53,7 @@ class Channels:
         self._listener = listener
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
-        self._is_listening = True
         self._links: dict[ControlLink, None] = {}  # in the order in which they came
-        # All but node processes, and since when each has been connected; the next one to be read
-        # comes first.
-        self._others: dict[ControlLink, float] = {}
-        self._strangers: set[ControlLink] = set()  # those that have not said who they are
         self._nodes: dict[ControlLink, tuple[str, ...]] = {}  # as they said hello
         self.parted: dict[tuple[str, ...], float] = {}
         self._waker: socket.socket | None = None
@@ -87,19 +78,17 @@ class Channels:
         A message that is not understood comes as the error that says why.
         """
         ready = self._ready()
-        if self._listener in ready or not self._is_listening:
-            self._let_in()
+        if self._listener in ready:
+            while (stream := self._listener.accept()) is not None:
+                stream.setblocking(False)
+                link = ControlLink(stream, (control.Hello, control.Watch), STRANGER)
+                self._links[link] = None
+                self._selector.register(link, selectors.EVENT_READ)
             ready = self._ready()  # who has just come in may have said something, and have gone
-        for link in tuple(self._nodes):
+        others = [link for link in self._links if link not in self._nodes]
+        for link in (*self._nodes, *others):
             if link in ready:
                 yield from self._read(link)
-        until_s = time.monotonic() + _OTHERS_S
-        for link in tuple(self._others):
-            if link in self._others and link in ready:
-                self._others[link] = self._others.pop(link)
-                yield from self._read(link)
-            if time.monotonic() > until_s:
-                break
 
     def send(self, message: Message) -> None:
         """Send to all node processes."""
@@ -151,8 +140,6 @@ class Channels:
 
     def hang_up(self, link: ControlLink) -> None:
         """Neither send to this one nor hear it any more."""
-        self._others.pop(link, None)
-        self._strangers.discard(link)
         if link in self._links:
             del self._links[link]
             self._selector.unregister(link)
@@ -184,32 +171,8 @@ class Channels:
                 if link in self._nodes:
                     self.parted[self._nodes[link]] = time.monotonic()
                 self.hang_up(link)
-            elif link in self._strangers and link.unfinished_bytes > _LONGEST_GREETING_BYTES:
-                yield link, ControlError(f"{STRANGER} sent a line without an end")
             if link not in self._nodes:
                 return
-
-    def _let_in(self) -> None:
-        """Accept those that wait, while there is room; what stays silent makes room for them."""
-        now_s = time.monotonic()
-        while len(self._others) < _MOST_OTHERS and (stream := self._listener.accept()) is not None:
-            stream.setblocking(False)
-            link = ControlLink(stream, (control.Hello, control.Watch), STRANGER)
-            self._links[link] = None
-            self._others[link] = now_s
-            self._strangers.add(link)
-            self._selector.register(link, selectors.EVENT_READ)
-        is_full = len(self._others) >= _MOST_OTHERS
-        if is_full:
-            silent = [each for each in self._strangers if now_s - self._others[each] > _SILENT_S]
-            for link in silent:
-                self.hang_up(link)
-        if is_full == self._is_listening:  # else whoever waits there would end each wait at once
-            if is_full:
-                self._selector.unregister(self._listener)
-            else:
-                self._selector.register(self._listener, selectors.EVENT_READ)
-            self._is_listening = not is_full
 
     def _message_in(self, line: bytes, link: ControlLink) -> Message | ControlError:
         """The message, after which it is known who is at the other end; else why there is none."""
@@ -217,9 +180,7 @@ class Channels:
             message = link.decode(line)
         except ControlError as error:
             return error
-        self._strangers.discard(link)
         if isinstance(message, control.Hello):
-            self._others.pop(link, None)
             self._nodes[link] = tuple(message.nodes)
             link.accept(control.FROM_NODES)
             link.peer = f"the process of {' and '.join(message.nodes)}"
