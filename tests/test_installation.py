@@ -27,7 +27,6 @@ from neuros.installation.command import (
     build_containers,
     build_documentation,
     extras_of,
-    shared_memory_as_found,
 )
 from neuros.installation.machine import Machine, clean_environment, explain_missing_library
 from neuros.installation.packages import explain_failure, pip_settings
@@ -137,14 +136,6 @@ def test_the_extras_are_those_of_the_project() -> None:
     text = (ROOT / "pyproject.toml").read_text("utf-8")
     declared = tomllib.loads(text)["project"]["optional-dependencies"]
     assert extras_of(text) == tuple(declared)
-
-
-def test_shared_memory_keeps_only_what_was_there_before(tmp_path: Path) -> None:
-    (tmp_path / "lttng-ust-wait-6").touch()
-    (tmp_path / "of-others").touch()
-    with shared_memory_as_found(tmp_path):
-        (tmp_path / "lttng-ust-wait-6-0").touch()
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["lttng-ust-wait-6", "of-others"]
 
 
 def test_progress_in_a_log_is_a_line_per_step_and_no_detail() -> None:

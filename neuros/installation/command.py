@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
 import platform
 import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -316,7 +315,13 @@ class Environment:
             raise EnvironmentFault(f"{self._root} cannot be written: {remedy}")
         version = self.python_version()
         is_new = version is None
-        self._leave_out_nest(version or self._make())
+        version = version or self._make()
+        if version > NEWEST_FOR_NEST and "nest" in self.extras:
+            self.extras = tuple(extra for extra in self.extras if extra != "nest")
+            self._progress.step(
+                f"NEST is left out: it has no packages for Python {dotted(version)} yet "
+                "(to have it, remove .venv and run install.py with Python 3.13 or older)"
+            )
         self._fill()
         faults = self._prove()
         if faults and not is_new:
@@ -364,14 +369,6 @@ class Environment:
             raise EnvironmentFault(f".venv cannot be made: {why}; then install.py again")
         return sys.version_info[:2]
 
-    def _leave_out_nest(self, version: tuple[int, int]) -> None:
-        if version > NEWEST_FOR_NEST and "nest" in self.extras:
-            self.extras = tuple(extra for extra in self.extras if extra != "nest")
-            self._progress.step(
-                f"NEST is left out: it has no packages for Python {dotted(version)} yet "
-                "(to have it, remove .venv and run install.py with Python 3.13 or older)"
-            )
-
     def _fill(self) -> None:
         self._unfinished.touch()
         environ = {**clean_environment(os.environ), **self._pip_settings}
@@ -381,13 +378,12 @@ class Environment:
         """Use every part in a process of its own; one sentence for each that fails."""
         versions: list[str] = []
         faults: list[str] = []
-        with shared_memory_as_found():
-            for proof in (_ROS, *(_PROOFS[extra] for extra in self.extras if extra in _PROOFS)):
-                self._progress.detail(f"importing {proof.name}")
-                try:
-                    versions.append(f"{proof.name} {self._version_of(proof)}")
-                except (ImportError, subprocess.TimeoutExpired) as error:
-                    faults.append(f"{proof.name} does not import ({error})")
+        for proof in (_ROS, *(_PROOFS[extra] for extra in self.extras if extra in _PROOFS)):
+            self._progress.detail(f"importing {proof.name}")
+            try:
+                versions.append(f"{proof.name} {self._version_of(proof)}")
+            except (ImportError, subprocess.TimeoutExpired) as error:
+                faults.append(f"{proof.name} does not import ({error})")
         if versions:
             self._progress.step(f"these import: {', '.join(versions)}")
         return faults
@@ -412,15 +408,3 @@ class Environment:
             timeout=_PROOF_TIMEOUT_S,
             check=False,
         )
-
-
-@contextlib.contextmanager
-def shared_memory_as_found(folder: Path = Path("/dev/shm")) -> Iterator[None]:
-    """Remove what importing ROS 2 leaves in shared memory: its tracing library never does."""
-    before = set(folder.glob("lttng-ust-wait-*"))
-    try:
-        yield
-    finally:
-        for file in set(folder.glob("lttng-ust-wait-*")) - before:
-            with contextlib.suppress(OSError):
-                file.unlink()

@@ -61,6 +61,7 @@ _NOT_FOR_PROCESSOR = (
     r"(?P<package>[\w.-]+?)(==\S+)?\s+has\s+no\s+wheels\s+with\s+a\s+matching\s+platform\s+tag"
     r"\s+\(e\.g\.,\s+`\w*?_(?P<platform>[a-z]\w*)`\)"
 )
+_EXTRA_BYTES = {"tensorflow": 2.5e9, "dev": 0.2e9, "docs": 0.2e9, "benchmark": 0.4e9}
 _DISK_IS_FULL = "No space left on device|Disk quota exceeded"
 _OF_NO_EFFECT = {
     *("disable-pip-version-check", "no-input", "no-color", "progress-bar", "quiet", "verbose"),
@@ -98,7 +99,9 @@ def install(
         EnvironmentFault: with a sentence for the user; the output of uv and pip is in a log file.
     """
     folder = python.parent.parent
-    free_bytes, need_bytes = shutil.disk_usage(folder).free, _needed_bytes(extras)
+    # Room for the packages and for uv's copies of them while it works.
+    need_bytes = 1.0e9 + sum(_EXTRA_BYTES.get(extra, 0.0) for extra in extras)
+    free_bytes = shutil.disk_usage(folder).free
     if free_bytes < need_bytes:
         raise EnvironmentFault(
             f"{root} has {free_bytes / 1e9:.1f} GB free and the packages need "
@@ -353,9 +356,3 @@ def explain_machine(text: str, again: str = "install.py") -> str | None:
         if re.search(pattern, text):
             return sentence
     return None
-
-
-def _needed_bytes(extras: Sequence[str]) -> float:
-    """Room for the packages and for uv's copies of them while it works."""
-    per_extra = {"tensorflow": 2.5e9, "dev": 0.2e9, "docs": 0.2e9, "benchmark": 0.4e9}
-    return 1.0e9 + sum(per_extra.get(extra, 0.0) for extra in extras)
