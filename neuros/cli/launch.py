@@ -14,7 +14,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from neuros.api.request import LaunchOptions
 from neuros.cli import EXIT_CODES
@@ -69,13 +69,6 @@ def _back_end_of(parsed: argparse.Namespace) -> str:
     return str(parsed.backend or os.environ.get("NEUROS_BACKEND") or AUTO)
 
 
-def _back_end_options(parsed: argparse.Namespace) -> dict[str, Any]:
-    """The options of the back end that were given."""
-    name = _back_end_of(parsed)
-    values = {} if name == AUTO else values_of(BACK_ENDS.load(name).options, parsed)
-    return {key: value for key, value in values.items() if value is not None}
-
-
 def _launch(parsed: argparse.Namespace) -> int:
     """Run a project; returns the exit code."""
     with signals_noted() as (signals, waker):
@@ -84,7 +77,10 @@ def _launch(parsed: argparse.Namespace) -> int:
         from neuros.cli.environments import make_shown_environments, signals_interrupt
 
         options = parsed_as(LaunchOptions, parsed)
-        options = replace(options, backend_options=_back_end_options(parsed))
+        name = _back_end_of(parsed)
+        values = {} if name == AUTO else values_of(BACK_ENDS.load(name).options, parsed)
+        given = {key: value for key, value in values.items() if value is not None}
+        options = replace(options, backend_options=given)
         project, messages = load_with_messages(parsed)
         # To reach other machines, and to prepare them, may take minutes.
         heeding = nullcontext() if options.deployment is None else signals_interrupt(signals)

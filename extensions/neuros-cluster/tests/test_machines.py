@@ -15,7 +15,7 @@ from neuros_cluster.agent import Agent, remove_old_runs
 from neuros_cluster.deployment import _texts
 from neuros_cluster.deployment_file import Host
 from neuros_cluster.files import RECEIVED, RUNS, Follower, TreeStore, scan, write_chunk
-from neuros_cluster.machine import ClockOffset, Machine, agent_command
+from neuros_cluster.machine import ClockOffset, agent_command
 from neuros_cluster.messages import (
     FROM_AGENT,
     TO_AGENT,
