@@ -24,17 +24,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from neuros_dashboard.web import await_server
 from playwright.sync_api import sync_playwright
 from tutorial_files import files_of, steps
-
-from neuros.viewers.web import await_server
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / "docs" / "figures"
 DEADLINE_MS = 120_000
 RERUN_DRAWS_MS = 40_000  # on a canvas that says nothing of what it shows, without a graphics card
 WHISKEYE = ROOT / "examples" / "4_neurorobotics" / "whiskeye" / "strict.json"
-RING = ROOT / "tests" / "viewers" / "dashboard" / "ring" / "spiking.json"
+RING = ROOT / "extensions" / "neuros-dashboard" / "tests" / "ring" / "spiking.json"
 SIZE: Any = {"width": 1300, "height": 1000}
 
 LONG = ("--set", "nodes.robot.environment.DURATION=1000")

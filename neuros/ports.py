@@ -588,6 +588,60 @@ class Subcommand:
     is_for_people: bool = True
 
 
+@dataclass(frozen=True)
+class Shown:
+    """The run that is shown.
+
+    Attributes:
+        environment: what the environment of its nodes has beside that of the launcher.
+        logs: by node.
+        names: the nodes of this run; the others of the project run elsewhere.
+    """
+
+    run_id: str
+    folder: Path
+    environment: Mapping[str, str]
+    logs: Mapping[str, Path]
+    project: Project
+    names: Sequence[str]
+    is_one_process: bool
+
+
+class View(Protocol):
+    """Shows one run while it goes on."""
+
+    def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None:
+        """Open it, once there is a control socket; ``log`` tells the user, with a severity.
+
+        Raises ``EnvironmentFault``.
+        """
+
+    def finish(self) -> None:
+        """Close it with the run, also where it was not started."""
+
+
+class LaunchExtension(ABC):
+    """Further options of ``neuros launch``: each flag is an entry point of ``neuros.launch``."""
+
+    options: Sequence[Option] = ()
+
+    @abstractmethod
+    def prepare(
+        self, options: Mapping[str, Any], back_end: BackEnd, *, is_isolated: bool
+    ) -> View | None:
+        """Find what is needed to show the run as the options want it; ``None``: they want nothing.
+
+        Args:
+            options: the value of each of :attr:`options`, by name.
+            back_end: of the run.
+            is_isolated: whether the run has a network of its own.
+
+        Raises:
+            UsageError: for values that make no sense.
+            EnvironmentFault: if something is missing here.
+        """
+
+
 class ModelFormat(ABC):
     """A format of models besides MuJoCo's own, an entry point of the group ``neuros.models``.
 

@@ -34,6 +34,7 @@ from neuros.ports import (
     BackEnd,
     Deployment,
     DeploymentKind,
+    LaunchExtension,
     ModelFormat,
     Notice,
     Subcommand,
@@ -173,6 +174,7 @@ DEPLOYMENTS: Registry[DeploymentKind] = Registry(
 )
 TRANSPORTS: Registry[TransportKind] = Registry("neuros.transports", "transport", TransportKind)
 SUBCOMMANDS: Registry[Subcommand] = Registry("neuros.commands", "command", Subcommand)
+LAUNCH: Registry[LaunchExtension] = Registry("neuros.launch", "option", LaunchExtension)
 NAMES: Registry[Any] = Registry("neuros.names", "name in neuros", object)
 MODELS: Registry[ModelFormat] = Registry(
     "neuros.models", "model format", ModelFormat, further=["xml", "mjcf"]

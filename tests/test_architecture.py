@@ -58,7 +58,6 @@ PACKAGES = (
     Package(4, ("visualise",)),
     Package(5, ("node",)),
     Package(5, ("launcher",)),
-    Package(6, ("viewers",)),
     Package(7, ("api",)),
     Package(7, ("testing",)),
     Package(8, ("pytest_plugin", "gym", "datasets")),
@@ -121,8 +120,6 @@ THIRD_PARTY: dict[str, set[str]] = {
     "visualise.program": {"matplotlib", "numpy"},
     "recording.columns": {"rosbags", "numpy"},
     "bag": {"rosbags", "numpy"},
-    "viewers.dashboard": {"starlette", "uvicorn"},
-    "viewers.rerun_feed": {"rerun", "numpy"},
 }
 # The engine is pure: no threads, no wall clock, no files.
 IMPURE = {

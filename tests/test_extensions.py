@@ -118,6 +118,28 @@ def test_so_is_that_of_a_deployment(
     assert "'machines' is in the extension neuros-cluster, which is" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("flag", ["--dashboard-port=1", "-gz"])
+def test_so_is_that_of_an_option_of_launch(
+    flag: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
+    monkeypatch.setattr("neuros.cli.launch.LAUNCH", Registry("neuros.launch", "option", object))
+    with pytest.raises(SystemExit) as ended:
+        main(["launch", "project", flag])
+    assert ended.value.code == 2
+    wanted = f"option '{flag.partition('=')[0].replace('-gz', '-g')}' is in the extension neuros-"
+    assert wanted in capsys.readouterr().err
+
+
+def test_a_launch_without_options_of_extensions_looks_for_none(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """To find them takes some 10 ms."""
+    monkeypatch.setattr("neuros.cli.launch.LAUNCH", None)
+    assert main(["launch", "nowhere", "--duration", "1", "--backend=process"]) == 3
+    assert "nowhere" in capsys.readouterr().err
+
+
 def test_a_python_elsewhere_finds_extensions_where_the_core_says(tmp_path: Path) -> None:
     for name, folder in libraries().items():
         (tmp_path / name).symlink_to(folder, target_is_directory=True)

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from browser import browser_page
 from launching import start
 from PIL import Image, ImageChops
-from viewers.dashboard.browser import browser_page
-from viewers.dashboard.visitor import address
+from visitor import address
 
 from neuros.backends.pythons import find_python
 from neuros.installation.machine import NEWEST_FOR_NEST, clean_environment
@@ -228,7 +228,8 @@ def test_three_commands_lead_to_a_robot_that_moves(
     environ["PATH"] = f"{tmp_path / 'venv' / 'bin'}{os.pathsep}{environ['PATH']}"
     made, progress = tmp_path / "venv", Progress(sys.stdout)
     installer = Installer(made / "bin" / "python", made, tmp_path / "log", progress, environ)
-    installer.install([f"{wheel}[mujoco,nest,plot]"])
+    dashboard = ROOT / "extensions" / "neuros-dashboard"
+    installer.install([f"{wheel}[mujoco,nest,plot]", str(dashboard)])
     run("neuros", "example", "whiskeye", cwd=tmp_path, environ=environ)
     see_a_robot_that_turns(
         tmp_path / "whiskeye", environ, SCREENSHOTS / ".".join(map(str, version))

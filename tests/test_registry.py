@@ -12,7 +12,6 @@ import pytest
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import BackEnd
 from neuros.registry import BACK_ENDS, EXECUTORS, OWN, TRANSPORTS
-from neuros.viewers.viewer import VIEWERS
 
 ROOT = Path(__file__).resolve().parents[1]
 FILES = sorted((ROOT / "neuros").rglob("*.py"))
@@ -28,8 +27,8 @@ def test_our_back_ends_can_be_loaded_and_say_what_help_needs(name: str) -> None:
     assert back_end.place
 
 
-def test_our_transports_viewers_and_executors_can_be_loaded() -> None:
-    for registry in (TRANSPORTS, VIEWERS, EXECUTORS):
+def test_our_transports_and_executors_can_be_loaded() -> None:
+    for registry in (TRANSPORTS, EXECUTORS):
         assert [registry.load(name).name for name in registry] == [*registry]
 
 

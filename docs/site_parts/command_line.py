@@ -69,15 +69,19 @@ def add_option_tables(app: Sphinx | None, page: str, source: list[str]) -> None:
 
 
 def _table(name: str, page: str) -> str:
-    """The options of a command that a dataclass declares."""
+    """The options of a command that a dataclass declares, and extensions do."""
     from neuros_analysis.options import SweepOptions
 
     from neuros.api.request import LaunchOptions, Request
     from neuros.options import options_of
+    from neuros.registry import LAUNCH
 
     in_python = {each.name for cls in (Request, SweepOptions) for each in options_of(cls)}
     declared_in = {cls.__name__: cls for cls in (LaunchOptions, SweepOptions)}
     shown = [each for each in options_of(declared_in[name]) if each.flags]
+    if name == LaunchOptions.__name__:
+        extensions = dict.fromkeys(LAUNCH.load(flag) for flag in LAUNCH)
+        shown += [each for extension in extensions for each in extension.options]
     rows = [_option_row(each, page, in_python) for each in shown]
     head = ["| option | in Python | meaning | default |", "| --- | --- | --- | --- |"]
     return "\n".join([*head, *rows])

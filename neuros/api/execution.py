@@ -47,9 +47,9 @@ from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
 from neuros.options import recorded_values
 from neuros.ordinary_files import open_log
+from neuros.ports import Shown, View
 from neuros.recording.recording_plan import RecordingPlan
 from neuros.recording.run_file import RUN_FILE, write_run_file
-from neuros.viewers.viewer import Shown, Views
 
 EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)
@@ -64,7 +64,7 @@ class Execution:
         signals: numbers of the signals that have arrived; signal handlers append to it.
         waker: bytes arrive here whenever a signal does, or a wish.
         wishes: reasons for which this program wants the run to end, drained.
-        views: what it is to be looked at with.
+        views: what shows it while it goes on.
 
     Raises:
         UsageError: if there can be no such run folder, domain or recording.
@@ -78,7 +78,7 @@ class Execution:
         signals: list[int],
         waker: socket.socket,
         wishes: Sequence[str] = (),
-        views: Views | None = None,
+        views: Sequence[View] = (),
     ) -> None:
         self._plan = plan
         self._signals = signals
@@ -173,8 +173,8 @@ class Execution:
             outcome = supervisor.outcome
             duration = self._plan.request.end
             self._console.follow(Progress(outcome, duration.wall_s, duration.sim_s))
-            if self._views is not None:
-                self._views.start(self._shown(), reaper, self._console.log)
+            for view in self._views:
+                view.start(self._shown(), reaper, self._console.log)
             supervisor.run()
         except BaseException as error:  # for run.json; the command line knows what to say
             outcome.exit_code = EXIT_ENVIRONMENT if isinstance(error, EnvironmentFault) else 1
@@ -188,8 +188,8 @@ class Execution:
             removed = removed_folders(self._files, self.folder)
             for fault in (*removed, *outcome.faults, *left_behind, *faults):
                 outcome.fail(fault, EXIT_ENVIRONMENT)
-            if self._views is not None:
-                self._views.finish()
+            for view in self._views:
+                view.finish()
             if not reaper.is_on_duty:
                 self._console.log("WARN", "the reaper was killed: the launcher does its work")
             reaper.leave()  # it works while the record is made

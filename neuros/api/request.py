@@ -27,12 +27,6 @@ def _back_ends() -> Iterable[str]:
     return [AUTO, *BACK_ENDS]
 
 
-def _viewers() -> Iterable[str]:
-    from neuros.viewers.viewer import VIEWERS
-
-    return VIEWERS
-
-
 @dataclass(frozen=True, kw_only=True)
 class ProjectOptions:
     """Changes to a project, for every command that reads one."""
@@ -296,50 +290,6 @@ class Request(ProjectOptions):
 class LaunchOptions(Request):
     """Options of the command line alone, besides those of every run."""
 
-    viewer: Sequence[str] = option(
-        "--viewer",
-        is_repeatable=True,
-        suggestions=_viewers,
-        metavar="NAME",
-        is_recorded=False,
-        page="dashboard.md#viewers",
-        help="show the run with this viewer: dashboard, rqt_graph, rviz2 or rerun; other Python"
-        " packages may add viewers",
-    )
-    dashboard: bool = option(
-        "--dashboard",
-        default=False,
-        is_recorded=False,
-        page="dashboard.md",
-        help="print the address (on 127.0.0.1) of a page that shows the run in a browser: robots"
-        " in 3-D, the graph, packets, images, logs, load; the page can pause, step and stop the"
-        " run",
-    )
-    dashboard_port: int | None = option(
-        "--dashboard-port",
-        parse=int,
-        metavar="PORT",
-        is_recorded=False,
-        default_help="any free one",
-        help="serve the dashboard on this port; implies --dashboard",
-    )
-    node_graph: bool = option(
-        "-g",
-        "--node-graph",
-        default=False,
-        is_recorded=False,
-        page="dashboard.md#rqt_graph-rviz-and-rerun",
-        help="show the graph of the run: rqt_graph where it can run, else the dashboard",
-    )
-    visualisations: bool = option(
-        "-z",
-        "--visualisations",
-        default=False,
-        is_recorded=False,
-        page="dashboard.md#rqt_graph-rviz-and-rerun",
-        help="show poses, images, scans and numbers: rviz2 where it can run, else Rerun in a"
-        " browser (pip install 'neuros[rerun]')",
-    )
     dry_run: bool = option(
         "--dry-run",
         default=False,

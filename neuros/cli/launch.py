@@ -19,14 +19,12 @@ from typing import TYPE_CHECKING
 from neuros.api.request import LaunchOptions
 from neuros.cli import EXIT_CODES
 from neuros.cli.common import add_project, load_with_messages
-from neuros.errors import EnvironmentFault, NeurosError, UsageError
+from neuros.errors import EnvironmentFault, NeurosError
 from neuros.options import add_options, parsed_as, values_of
-from neuros.registry import AUTO, BACK_ENDS
+from neuros.registry import AUTO, BACK_ENDS, LAUNCH
 
 if TYPE_CHECKING:
     from neuros.api.plan import Plan
-    from neuros.ports import BackEnd
-    from neuros.viewers.viewer import Views
 
 # <linux/sched.h>, <linux/sockios.h>, <net/if.h>
 _CLONE_NEWUSER, _CLONE_NEWNET = 0x10000000, 0x40000000
@@ -44,11 +42,14 @@ def add_launch(launch: argparse.ArgumentParser) -> None:
     launch.description = "Run a project: start its nodes, connect them, wait until all have ended."
     launch.epilog = EXIT_CODES
     add_project(launch, LaunchOptions)
-    launch.set_defaults(command=_launch)
+    launch.set_defaults(command=_launch, extensions=())
 
 
 def prepare_launch(launch: argparse.ArgumentParser, arguments: Sequence[str]) -> None:
-    """Add the options of the back end that the arguments name; for ``--help``, of all."""
+    """Add the options of the back end that the arguments name, and of extensions that they need.
+
+    For ``--help``, and where a shell completes, those of all.
+    """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--backend", nargs="?")
     first.add_argument("-h", "--help", action="store_true")
@@ -63,6 +64,16 @@ def prepare_launch(launch: argparse.ArgumentParser, arguments: Sequence[str]) ->
             continue
         group = launch.add_argument_group(f"back end {name}", f"each node in {back_end.place}")
         add_options(group, [replace(each, group="") for each in back_end.options])
+    flags = {word.partition("=")[0] for word in arguments if word.startswith("-")}
+    unknown = flags - {*launch._option_string_actions}
+    if unknown or asked.help or "_ARGCOMPLETE" in os.environ:  # to find them takes some 10 ms
+        extensions = [*dict.fromkeys(LAUNCH.load(flag) for flag in LAUNCH)]
+        for extension in extensions:
+            add_options(launch, extension.options)
+        launch.set_defaults(extensions=extensions)
+    for flag in sorted(unknown):
+        if missing := LAUNCH.missing(flag) or LAUNCH.missing(flag[:2]):  # as in -gz
+            launch.error(missing)
 
 
 def _back_end_of(parsed: argparse.Namespace) -> str:
@@ -93,9 +104,16 @@ def _launch(parsed: argparse.Namespace) -> int:
             return _dry_run(plan)
         if ended := make_shown_environments(plan.pythons, signals, messages):
             return ended
-        views = _views(options, plan.back_end)  # the dashboard listens where the browser is
+        # Before the run leaves the network: a dashboard listens where the browser is.
+        prepared = [
+            each.prepare(
+                values_of(each.options, parsed), plan.back_end, is_isolated=options.isolate
+            )
+            for each in parsed.extensions
+        ]
         if options.isolate and not plan.back_end.has_own_network:
             _enter_own_network()
+        views = [view for view in prepared if view is not None]
         run = Execution(plan, sys.stdout, signals, waker, views=views)
         exit_code = int(run.run()["exit_code"])
         if run.output_failure is not None and not exit_code:
@@ -138,24 +156,6 @@ def _enter_own_network() -> None:
         raise EnvironmentFault(
             f"--isolate: the run gets no network here ({error.strerror}): {_REMEDY}"
         ) from error
-
-
-def _views(options: LaunchOptions, back_end: BackEnd) -> Views | None:
-    """What the run is to be looked at with; ``None``: nothing."""
-    subjects = {"--node-graph": "graph"} if options.node_graph else {}
-    subjects |= {"--visualisations": "packets"} if options.visualisations else {}
-    names = list(options.viewer)
-    if options.isolate and (subjects or {*names} - {"dashboard"}):
-        raise UsageError(
-            "--isolate with -g, -z or --viewer: they cannot see into the run; use --dashboard"
-        )
-    if options.dashboard or options.dashboard_port is not None:
-        names.append("dashboard")
-    if not (names or subjects):
-        return None
-    from neuros.viewers.viewer import Views
-
-    return Views(back_end, names, subjects, options.dashboard_port)
 
 
 def _dry_run(plan: Plan) -> int:

@@ -65,8 +65,6 @@ COMMANDS = {
     "import-plugin": Subcommand("neuros.cli.projects", is_for_people=False),
     "recorder": Subcommand("neuros.cli.recorder", is_for_people=False),
     "replayed": Subcommand("neuros.cli.replay"),
-    "dashboard": Subcommand("neuros.cli.views", is_for_people=False),
-    "view": Subcommand("neuros.cli.views", is_for_people=False),
 }
 """Of NeuROS itself; :data:`~neuros.registry.SUBCOMMANDS` has those of extensions."""
 
@@ -225,7 +223,7 @@ def _main(arguments: Sequence[str]) -> int:
 
 
 def parser(command: str | None = None) -> argparse.ArgumentParser:
-    """The parser of the command line; ``command``: with the options of this one alone."""
+    """The parser of the command line, with all options; ``command``: with those of this one."""
     result = _Parser(
         prog="neuros",
         description="Run closed loops of simulators, spiking networks and robots on ROS 2.",
@@ -247,6 +245,9 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
             module = import_module(each.module)
             getattr(module, f"add_{name.replace('-', '_')}")(added)
             added.prepare = getattr(module, f"prepare_{name}", None)
+            if command is None and added.prepare is not None:
+                added.prepare(added, ["--help"])
+                added.prepare = None
     return result
 
 

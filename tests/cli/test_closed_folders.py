@@ -88,7 +88,6 @@ UNKNOWN = """
 # They are told no path, or ask an engine first, or are started with more than arguments.
 PATHLESS = {
     *("ps", "agent", "containers list", "containers ls", "containers remove", "recorder"),
-    *("dashboard", "view"),
 }
 # Runs all commands one after another: each by itself would take half a second to begin.
 PROGRAM = """

@@ -30,6 +30,9 @@ from neuros_analysis.comparison import comparison_rows
 from neuros_analysis.findings import findings_of
 from neuros_analysis.review import open_for_review
 from neuros_analysis.run_pages import figures_of, panels_page, png, report_page, world_pages
+from neuros_dashboard.live_metrics import LiveRun
+from neuros_dashboard.pages import Pages
+from neuros_dashboard.server import Dashboard
 
 import neuros.bag
 from neuros import control
@@ -52,9 +55,6 @@ from neuros.transport.large_packets import LargeInput, LargeOutput
 from neuros.transport.message_buffers import message_buffers
 from neuros.transport.ros import data_qos, position_of
 from neuros.transport.ros_graph import qos_profile
-from neuros.viewers.dashboard.live_metrics import LiveRun
-from neuros.viewers.dashboard.pages import Pages
-from neuros.viewers.dashboard.server import Dashboard
 from tests.message_packages import MANIFEST
 from tests.message_values import message_classes
 from tests.run_folders import accounting, run_folder

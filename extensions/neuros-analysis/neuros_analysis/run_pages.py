@@ -43,7 +43,7 @@ LONGEST_ARRAY = 4096
 MOST_FRAMES = 6000
 """Of the page of a world; of a longer recording, every k-th frame is shown."""
 
-_STATIC = files("neuros") / "viewers" / "dashboard" / "static"
+_SCRIPTS = files("neuros") / "javascript"
 _WORLD_SCRIPTS = {"library": "vendor/three.iife.min.js", "scene": "scene.js"}
 _PANELS_SCRIPTS = ("format.js", "plane.js", "spikes.js", "raster.js", "activity.js")
 _IMPORT = re.compile(r"^import .*$", re.MULTILINE)
@@ -269,7 +269,7 @@ def panels_page(run: ReviewedRun) -> str | None:
         panels = [p for name in outputs for p in _panels(name, bag[name], bag.start_ns)]
     if not panels:
         return None
-    scripts = (_IMPORT.sub("", (_STATIC / name).read_text("utf-8")) for name in _PANELS_SCRIPTS)
+    scripts = (_IMPORT.sub("", (_SCRIPTS / name).read_text("utf-8")) for name in _PANELS_SCRIPTS)
     title = f"Activity in {run.name}"
     return _filled("panels_page.html", title, scripts="\n".join(scripts), panels=_in_script(panels))
 
@@ -329,7 +329,7 @@ def world_pages(
     Args:
         complain: told of each file that is damaged; what comes before the damage is shown.
     """
-    scripts = {key: (_STATIC / name).read_text("utf-8") for key, name in _WORLD_SCRIPTS.items()}
+    scripts = {key: (_SCRIPTS / name).read_text("utf-8") for key, name in _WORLD_SCRIPTS.items()}
     found = {}
     for name in run.nodes:
         scenes = list(_scenes(run.folder / name / WORLD_LOG, complain))

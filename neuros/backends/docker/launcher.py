@@ -1,4 +1,4 @@
-"""Containers of a run: one for each node, and those of graphical tools of ROS."""
+"""Containers of a run: one for each node."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import Any
 
 import requests
 from docker import DockerClient
-from docker.errors import DockerException, ImageNotFound
+from docker.errors import DockerException
 
 from neuros.backends.docker import leftovers
 from neuros.backends.docker.engine import (
@@ -31,12 +31,10 @@ from neuros.backends.docker.leftovers import RUN_LABEL
 from neuros.backends.docker.settings import (
     NETWORK_MODE,
     NO_NETWORK,
-    X11,
     as_here,
     container_name,
     container_settings,
     inside,
-    mount,
     shared_memory,
 )
 from neuros.backends.node_command import (
@@ -49,15 +47,11 @@ from neuros.backends.node_command import (
 )
 from neuros.backends.run_processes import RUN_ID, RunProcesses, started_at
 from neuros.backends.shared_memory import hold
-from neuros.distribution import build_command
 from neuros.errors import EnvironmentFault, results_of
-from neuros.ports import Deployment, NodeProgram, Notice, Reaper
+from neuros.ports import Deployment, NodeProgram, Notice
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import Folders, Node, NodeFile, memory_text
 from neuros.stacks import ProcessThreads, threads_of
-
-TOOL_IMAGE = "neuros_tools"
-_STOP_S = 2
 
 _MOST_AT_ONCE = 16
 _OUT_OF_MEMORY = 128 + signal.SIGKILL
@@ -407,57 +401,3 @@ class ContainerEvents(threading.Thread):
         for pid in self.pids(node):
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.kill(pid, number)
-
-
-def find_tool_image(environ: Mapping[str, str] = os.environ) -> str | None:
-    """``None`` if there is the image, else in a few words why not."""
-    try:
-        with contextlib.closing(connect(environ)) as engine:
-            engine.images.get(TOOL_IMAGE)
-    except EnvironmentFault:
-        return f"there is no Docker engine for the image {TOOL_IMAGE}"
-    except ImageNotFound:
-        return f"the image {TOOL_IMAGE} is not built ({build_command(TOOL_IMAGE)})"
-    except (DockerException, requests.RequestException) as error:
-        return f"the Docker engine does not say whether it has the image {TOOL_IMAGE}: {error}"
-    return None
-
-
-class ToolContainer:
-    """A tool in a container: the host's network and display, the run folder to read.
-
-    Raises:
-        EnvironmentFault: if it cannot be started.
-    """
-
-    def __init__(
-        self, program: str, arguments: Sequence[str], run: Path, environment: Mapping[str, str]
-    ) -> None:
-        self._engine = connect()
-        passed = {key: os.environ[key] for key in ("DISPLAY", "XAUTHORITY") if key in os.environ}
-        seen = [run, X11, *map(Path, filter(None, [passed.get("XAUTHORITY")]))]
-        with engine_faults(f"{program} in a container of {TOOL_IMAGE}"):
-            self._container = self._engine.containers.run(
-                TOOL_IMAGE,
-                [program, *arguments],
-                detach=True,
-                auto_remove=True,
-                environment={**environment, **passed, "HOME": "/tmp", "ROS_LOG_DIR": "/tmp"},
-                labels={RUN_LABEL: environment.get(RUN_ID, ""), "neuros.run_folder": str(run)},
-                mounts=[mount(path, path) for path in seen if path.exists()],
-                network_mode="host",
-                ipc_mode="host",
-                user=f"{os.getuid()}:{os.getgid()}",
-                cap_drop=["ALL"],
-                security_opt=["no-new-privileges"],
-            )
-
-    def announce(self, reaper: Reaper) -> None:
-        """Have it removed if the launcher is killed."""
-        reaper.clean_with(leftovers.__name__, engine_socket(self._engine))
-
-    def finish(self) -> None:
-        """End it with the run."""
-        with contextlib.suppress(DockerException, requests.RequestException):
-            self._container.stop(timeout=_STOP_S)  # its window may have been closed long ago
-        self._engine.close()

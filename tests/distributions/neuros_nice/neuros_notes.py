@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neuros.ports import BackEnd, Reaper
 from neuros.viewers.viewer import Shown, Viewer
+
+from neuros.ports import BackEnd, Reaper
 
 
 class Note:

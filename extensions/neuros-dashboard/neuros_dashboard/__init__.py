@@ -1,0 +1,1 @@
+"""Viewers of a run: the dashboard, rqt_graph, RViz and Rerun."""

@@ -1,0 +1,445 @@
+"""A run as the pages of the dashboard see it: live metrics from counters of its nodes.
+
+The supervisor is asked over the control channel only while a page is open.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import itertools
+import time
+from collections import OrderedDict, deque
+from collections.abc import Mapping, Sequence
+from statistics import fmean
+from typing import Any, TypeAlias
+
+from neuros.control import (
+    WORLD,
+    Ended,
+    LogRecord,
+    LookAll,
+    Message,
+    Metrics,
+    NodeStatus,
+    PhaseChanged,
+    Report,
+    Watch,
+)
+from neuros.control.link import ControlLink
+from neuros.engine.metrics import in_flight_and_lost, time_budget_of
+from neuros.errors import ControlError
+from neuros_dashboard.pages import Pages, data_url
+
+WINDOW_S = 1.0
+"""Rates and shares are those of about the last second."""
+
+_STATES = ("executing", "waiting", "blocked", "idle", "registering", "scheduling", "paused")
+_COUNTS = ("sent", "outstanding", "received", "discarded", "unread")
+_MOST_SENT = 4096
+_MOST_TAKEN = 8
+_MOST_SHOWN = 256
+_UNDER_WAY_S = 0.02
+_LATE_S = 2.0
+_PERIOD_S = 0.2
+_PER_NODE_S = 0.0125
+_PATIENCE_S = 1.0
+_GEOMETRY_S = 20.0
+
+
+Pauses: TypeAlias = Sequence[tuple[int, int]]
+"""Start and end of times in which a node stood still, in nanoseconds."""
+
+
+class Latency:
+    """Latency of one connection: from the sending of a packet to the start of a hook on it.
+
+    Sender and receiver show themselves at different moments; what belongs together is told by the
+    packets' positions. Both count on the monotonic clock of one machine.
+    """
+
+    def __init__(self) -> None:
+        self._sent_ns: OrderedDict[int, int] = OrderedDict()
+        self._taken: deque[tuple[int, int, Pauses]] = deque(maxlen=_MOST_TAKEN)
+        self._last_ms: deque[float] = deque(maxlen=5)
+
+    def sent(self, last: int, times_ns: Sequence[int]) -> None:
+        """The last packets sent have been up to position ``last``."""
+        for position, time_ns in enumerate(times_ns, last - len(times_ns) + 1):
+            self._sent_ns[position] = time_ns
+        while len(self._sent_ns) > _MOST_SENT:
+            self._sent_ns.popitem(last=False)
+        self._match()
+
+    def taken(self, position: int, time_ns: int, paused_ns: Pauses = ()) -> None:
+        """A hook has started on a packet; its node stood still at times that do not count."""
+        if not self._taken or self._taken[-1][0] != position:
+            self._taken.append((position, time_ns, paused_ns))
+            self._match()
+
+    @property
+    def ms(self) -> float | None:
+        """The mean over the last few, ``None`` before the first."""
+        return fmean(self._last_ms) if self._last_ms else None
+
+    def _match(self) -> None:
+        for taken in tuple(self._taken):
+            position, time_ns, paused_ns = taken
+            sent_ns = self._sent_ns.get(position)
+            if sent_ns is not None:
+                self._taken.remove(taken)
+                still_ns = sum(
+                    max(0, min(end_ns, time_ns) - max(start_ns, sent_ns))
+                    for start_ns, end_ns in paused_ns
+                )
+                self._last_ms.append(max(0, time_ns - sent_ns - still_ns) / 1e6)
+
+
+class Speed:
+    """Growth of a counter, or of a time, over :data:`WINDOW_S`; one that goes back begins anew."""
+
+    def __init__(self) -> None:
+        self._points: deque[tuple[float, float]] = deque()
+
+    def note(self, now_s: float, value: float) -> None:
+        """It has that value now."""
+        if self._points and value < self._points[-1][1]:
+            self._points.clear()
+        self._points.append((now_s, value))
+        while len(self._points) > 2 and now_s - self._points[1][0] >= WINDOW_S:
+            self._points.popleft()
+
+    @property
+    def per_s(self) -> float:
+        """0 before there are two values."""
+        (first_s, first), (last_s, last) = self._points[0], self._points[-1]
+        return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
+
+
+class Loss:
+    """Packets of a best-effort connection that were lost on their way, so far.
+
+    Both ends show their counts at different moments, and what arrives while a hook executes is
+    taken in after it. So the receiver's count is compared with what had been sent shortly before it
+    last took in, and the least difference of a while counts: late packets are not lost.
+    """
+
+    def __init__(self) -> None:
+        self._sent: deque[tuple[float, int]] = deque(maxlen=_MOST_SHOWN)
+        self._missing: deque[tuple[float, float]] = deque()
+        self.count = 0
+
+    def sent(self, now_s: float, count: int) -> None:
+        """So many have been sent by now."""
+        self._sent.append((now_s, count))
+
+    def received(self, now_s: float, taken_in_s: float, count: int) -> None:
+        """So many have arrived of those that were there when the receiver last took in."""
+        sent = self._sent_by(taken_in_s - _UNDER_WAY_S)
+        if sent is None:
+            return
+        self._missing.append((now_s, sent - count))
+        if now_s - self._missing[0][0] >= _LATE_S:
+            self.count = max(self.count, int(min(missing for _, missing in self._missing)))
+            self._missing.popleft()
+
+    def _sent_by(self, then_s: float) -> float | None:
+        """The count of packets sent by then, if known."""
+        for (a_s, a), (b_s, b) in itertools.pairwise(self._sent):
+            if a_s <= then_s <= b_s:
+                return a + (b - a) * (then_s - a_s) / max(b_s - a_s, 1e-9)
+        is_since = self._sent and self._sent[-1][0] <= then_s
+        return self._sent[-1][1] if is_since else None
+
+
+class LiveMetrics:
+    """Live metrics of all nodes and connections, with as much of the past as they need.
+
+    Attributes:
+        nodes, connections: by name, ready for JSON.
+        sim_time: simulated seconds, ``None`` where no node owns time.
+    """
+
+    def __init__(self) -> None:
+        self.nodes: dict[str, dict[str, Any]] = {}
+        self.connections: dict[str, dict[str, Any]] = {}
+        self.sim_time: float | None = None
+        self._speeds: dict[tuple[str, str], Speed] = {}
+        self._latencies: dict[str, Latency] = {}
+        self._losses: dict[str, Loss] = {}
+        self._ended_factor: float | None = None
+
+    @property
+    def real_time_factor(self) -> float | None:
+        """Simulated seconds per second: now, and of the whole run once that is over."""
+        if self._ended_factor is not None:
+            return self._ended_factor
+        speed = self._speeds.get(("sim", ""))
+        return None if speed is None else speed.per_s
+
+    def take(self, status: NodeStatus) -> None:
+        """A node has shown itself."""
+        counters = status.counters
+        if counters is None:
+            self.nodes[status.node] = {"state": "loading", "cause": ""}
+            return
+        now_s, metrics = counters.now_s, counters.metrics
+        if status.sim_time is not None:
+            self.sim_time = status.sim_time
+            self._speed("sim", "", now_s, status.sim_time)
+        self._take_node(status.node, metrics, now_s)
+        for name, outgoing in metrics["outgoing"].items():
+            shown = self.connections.setdefault(name, {})
+            shown |= {key: outgoing[key] for key in ("sent", "outstanding", "is_blocked")}
+            shown["rate_hz"] = self._speed("sent", name, now_s, outgoing["sent"])
+            if outgoing["is_reliable"]:
+                shown["lost"] = 0
+            else:
+                self._losses.setdefault(name, Loss()).sent(now_s, outgoing["sent"])
+        for name, incoming in metrics["incoming"].items():
+            shown = self.connections.setdefault(name, {})
+            shown |= {key: incoming[key] for key in ("received", "discarded", "unread")}
+            rate_hz = self._speed("received", name, now_s, incoming["received"])
+            shown.setdefault("rate_hz", rate_hz)
+            if "sent" not in shown:  # an external topic, or a sender of another launcher
+                shown["rate_hz"] = rate_hz
+            if name in self._losses:
+                executing = metrics["executing"]
+                taken_in_s = now_s - (executing["for_s"] if executing else 0.0)
+                self._losses[name].received(now_s, taken_in_s, incoming["received"])
+                shown["lost"] = self._losses[name].count
+        for name, (last, times_ns) in counters.sent_ns.items():
+            self._latencies.setdefault(name, Latency()).sent(last, times_ns)
+        for name, (position, time_ns) in counters.taken_ns.items():
+            self._latencies.setdefault(name, Latency()).taken(position, time_ns, counters.paused_ns)
+        for name, latency in self._latencies.items():
+            self.connections[name]["latency_ms"] = latency.ms
+
+    def end(
+        self,
+        reports: Mapping[str, Report],
+        running_s: float | None,
+        real_time_factor: float | None,
+        has_drained: bool,
+    ) -> None:
+        """The run is over: counts are final, and rates and shares are those of the whole run.
+
+        Args:
+            reports: the last one of each node that has made one.
+            running_s: how long all nodes ran.
+            real_time_factor: of that time.
+            has_drained: whether packets in flight were waited for.
+        """
+        self.nodes = {name: {"state": "ended", "cause": ""} for name in self.nodes}
+        ends: dict[str, dict[str, int]] = {}
+        for name, report in reports.items():
+            if report.metrics is None:
+                continue
+            self._end_node(name, report.metrics, running_s)
+            counted: list[tuple[str, dict[str, Any]]] = [
+                *((name, {**counts}) for name, counts in report.metrics["outgoing"].items()),
+                *((name, {**counts}) for name, counts in report.metrics["incoming"].items()),
+            ]
+            for connection, counters in counted:
+                shown = self.connections.setdefault(connection, {})
+                shown |= {key: counters[key] for key in _COUNTS if key in counters}
+                if report.is_final:
+                    ends.setdefault(connection, {}).update(counters)
+        for connection, shown in self.connections.items():
+            count, final = shown.get("sent", shown.get("received")), ends.get(connection, {})
+            lost = None
+            if {"sent", "received"} <= {*final}:
+                _, lost = in_flight_and_lost(
+                    final["sent"], final["received"], final["outstanding"], has_drained
+                )
+            shown |= {
+                "is_blocked": False,
+                "latency_ms": None,
+                "rate_hz": count / running_s if count is not None and running_s else None,
+                "lost": lost,
+            }
+        self._ended_factor = real_time_factor
+
+    def _end_node(self, name: str, metrics: Metrics, running_s: float | None) -> None:
+        spent = time_budget_of(metrics, running_s)
+        self.nodes[name] = {
+            "state": "ended",
+            "cause": "",
+            "shares": {} if spent is None else spent.shares,
+            "hooks": {hook: _hook(each, None) for hook, each in metrics["hooks"].items()},
+        }
+
+    def _take_node(self, name: str, metrics: Metrics, now_s: float) -> None:
+        shares = {
+            state: self._speed(f"share {state}", name, now_s, _seconds(metrics, state))
+            for state in _STATES
+        }
+        executing = metrics["executing"]
+        self.nodes[name] = {
+            **metrics["state"],
+            "executing": executing["name"] if executing else None,
+            "shares": shares,
+            "hooks": {
+                hook: _hook(each, self._speed(f"hook {hook}", name, now_s, each["executions"]))
+                for hook, each in metrics["hooks"].items()
+            },
+        }
+
+    def _speed(self, kind: str, name: str, now_s: float, value: float) -> float:
+        speed = self._speeds.setdefault((kind, name), Speed())
+        speed.note(now_s, value)
+        return speed.per_s
+
+
+def _seconds(metrics: Metrics, cause: str) -> float:
+    spent = metrics["accounting"][cause]
+    return sum(spent.values()) if isinstance(spent, Mapping) else float(spent)
+
+
+def _hook(figures: Mapping[str, Any], rate_hz: float | None) -> dict[str, Any]:
+    executions, busy_s = figures["executions"], figures["busy_s"]
+    return {
+        "executions": executions,
+        "rate_hz": rate_hz,
+        "mean_ms": busy_s / executions * 1e3 if executions else None,
+    }
+
+
+class LiveRun:
+    """A run as its pages see it: asks the supervisor while a page is open, and shows the answers.
+
+    Args:
+        link: to the supervisor.
+        names: the nodes of the run.
+        start_s: monotonic time from which the pages count.
+
+    Attributes:
+        phase: the latest state of the run, for the pages.
+    """
+
+    def __init__(
+        self, pages: Pages, link: ControlLink, names: tuple[str, ...], start_s: float
+    ) -> None:
+        self._pages = pages
+        self._link = link
+        self._names = set(names)
+        self._metrics = LiveMetrics()
+        self._geometries: dict[str, asyncio.Future[str]] = {}
+        self._answered: set[str] = set()
+        self._has_answered = asyncio.Event()
+        self._is_over = asyncio.Event()
+        self._start_s = start_s
+        self.phase: dict[str, Any] = {"phase": "running", "is_paused": False}
+
+    async def run(self) -> None:
+        """Until the run is over."""
+        loop = asyncio.get_running_loop()
+        self.tell(Watch())
+        loop.add_reader(self._link.fileno(), self._receive)
+        asking = asyncio.create_task(self._ask())
+        try:
+            await self._is_over.wait()
+        finally:
+            asking.cancel()
+            loop.remove_reader(self._link.fileno())
+            self._link.close()
+
+    def tell(self, message: Message) -> None:
+        """Send to the supervisor, which always reads."""
+        if not self._is_over.is_set():
+            self._link.send(message)
+
+    async def geometry(self, node: str) -> str | None:
+        """The geometry of a node's simulated world, as JSON; ``None`` if it shows none."""
+        if node not in self._names:
+            return None
+        loop = asyncio.get_running_loop()
+        asked = self._geometries.setdefault(node, loop.create_future())
+        try:
+            return await asyncio.wait_for(asyncio.shield(asked), _GEOMETRY_S)
+        except asyncio.TimeoutError:
+            return None
+
+    def _wanted(self) -> Mapping[str, Mapping[str, Any]]:
+        """What pages show of packets and worlds, and the geometries that they wait for."""
+        wanted = self._pages.wanted()
+        for node in self._geometries:
+            wanted.setdefault(node, {}).setdefault(WORLD, {})["geometry"] = True
+        return wanted
+
+    async def _ask(self) -> None:
+        period_s = max(_PERIOD_S, _PER_NODE_S * len(self._names))
+        while True:
+            await self._pages.are_watched.wait()
+            self._answered.clear()
+            self._has_answered.clear()
+            asked_s = time.monotonic()
+            self.tell(LookAll(self._wanted()))
+            # A node whose hook holds Python's global lock answers late: the others need not wait.
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._has_answered.wait(), _PATIENCE_S)
+            self._show()
+            await asyncio.sleep(max(0.0, asked_s + period_s - time.monotonic()))
+
+    def _receive(self) -> None:
+        try:
+            messages = self._link.receive()
+        except ControlError as error:
+            self._pages.send("log", [f"[ERROR] [dashboard] {error}"])
+            return
+        if messages is None:
+            self._is_over.set()
+        for message in messages or ():
+            self._take(message)
+
+    def _take(self, message: Message) -> None:
+        match message:
+            case NodeStatus(node):
+                self._metrics.take(message)
+                self._show_samples(node, message.samples)
+                self._answered.add(node)
+                if self._answered >= self._names:
+                    self._has_answered.set()
+            case PhaseChanged():
+                self.phase = dict(vars(message))
+                self._pages.send("phase", self.phase)
+            case LogRecord(severity, text):
+                self._pages.send("log", [f"[{severity}] [neuros] {text}"])
+            case Ended(exit_code, reason, reports, running_s, real_time_factor, has_drained):
+                self._metrics.end(reports, running_s, real_time_factor, has_drained)
+                self._show()
+                self.phase = {"phase": "ended", "is_paused": False}
+                self.phase |= {"exit_code": exit_code, "reason": reason}
+                self._pages.send("phase", self.phase)
+
+    def _show(self) -> None:
+        metrics = self._metrics
+        self._pages.send(
+            "figures",
+            {
+                "t": time.monotonic() - self._start_s,
+                "nodes": metrics.nodes,
+                "connections": metrics.connections,
+                "sim_time": metrics.sim_time,
+                "real_time_factor": metrics.real_time_factor,
+            },
+        )
+
+    def _show_samples(self, node: str, samples: Mapping[str, dict[str, Any]]) -> None:
+        shown = {}
+        for port, sample in samples.items():
+            geometry = sample.pop("geometry", None)
+            if geometry is not None and (asked := self._geometries.pop(node, None)):
+                asked.set_result(geometry)
+            rows = [sample.get("values", ()), *sample.get("arrays", {}).values()]
+            for row in itertools.chain(*rows):
+                row[0] -= self._start_s
+            if "image" in sample:
+                sample["image"] = {
+                    "url": data_url(sample["image"]),
+                    "of": sample["image"]["of"],
+                    "encoding": sample["image"]["encoding"],
+                }
+            shown[f"{node}.{port}"] = sample
+        if shown:
+            self._pages.send("samples", shown)

@@ -1,0 +1,117 @@
+"""Programs beside a run: ``dashboard`` serves its page, ``rerun`` feeds a Rerun viewer.
+
+The first line of their standard input says of which run.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import socket
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+_LAST_LOG_BYTES = 1 << 16
+
+
+def feed_rerun() -> None:
+    """Send samples of the run's packets to Rerun until the run is over."""
+    from neuros.backends.control_sockets import connect_by
+    from neuros.control import TO_OBSERVERS
+    from neuros.control.link import ControlLink
+    from neuros_dashboard.rerun_feed import RerunFeed
+    from neuros_dashboard.visual_types import VisualTypes, look_on
+    from neuros_dashboard.web import await_server
+    from neuros_dashboard.windows import open_page
+
+    told = json.loads(sys.stdin.readline())
+    sources = {
+        each["name"]: (each["node"], each["port"], VisualTypes(each["type"]))
+        for each in told["sources"]
+    }
+    await_server(told["url"])
+    open_page(told["url"])
+    feed = RerunFeed(
+        told["project"], told["feed_url"], {name: source for name, (*_, source) in sources.items()}
+    )
+    link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
+    look_on(link, sources, feed.show)
+    feed.close()
+
+
+def serve_dashboard() -> None:
+    """Answer the page until the run is over."""
+    told = json.loads(sys.stdin.readline())
+    listening = socket.socket(fileno=told["descriptor"])
+    if not _is_looked_at(listening):
+        return
+    # Loading all this takes a fifth of a second of a core that the nodes can use.
+    import asyncio
+
+    asyncio.run(_serve(told, listening))
+
+
+async def _serve(told: Mapping[str, Any], listening: socket.socket) -> None:
+    from neuros.backends.control_sockets import connect_by
+    from neuros.control import TO_OBSERVERS
+    from neuros.control.link import ControlLink
+    from neuros_dashboard.live_metrics import LiveRun
+    from neuros_dashboard.pages import Pages
+    from neuros_dashboard.server import Dashboard
+
+    names, pages = tuple(told["names"]), Pages()
+    link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
+    run = LiveRun(pages, link, names, told["start_s"])
+    logs = {name: Path(path) for name, path in told["logs"].items()}
+    dashboard = Dashboard(told["plan"], lambda: _Log(logs), _load(told, names), pages, run)
+    await dashboard.serve(listening, told["token"], told["run"])
+
+
+def _is_looked_at(listening: socket.socket) -> bool:
+    """Wait until a browser opens the page; False if the run ends before."""
+    readable, _, _ = select.select([listening, sys.stdin], [], [])
+    return listening in readable
+
+
+def _load(told: Mapping[str, Any], names: tuple[str, ...]) -> Callable[[], Mapping[str, Any]]:
+    from neuros.api.observation import owner_of_processes
+    from neuros.recording.system_load import LAUNCHER, LoadMeter, LoadNow
+
+    owner = owner_of_processes(told["run"], names, is_one_process=told["is_one_process"])
+    load_now = LoadNow(LoadMeter(owner))
+
+    def load() -> Mapping[str, Any]:
+        load = load_now()
+        # What is not a node's is this process.
+        load["groups"]["dashboard"] = load["groups"].pop(LAUNCHER)
+        return load
+
+    return load
+
+
+class _Log:
+    """The new lines of the logs of a run, as the console shows them."""
+
+    def __init__(self, files: Mapping[str, Path]) -> None:
+        from neuros.backends.console import LogTail
+
+        self._lines: list[str] = []
+        self._tail = LogTail(files, self._take, colours=False, last_bytes=_LAST_LOG_BYTES)
+
+    def read(self) -> list[str]:
+        self._tail.poll()
+        lines, self._lines = self._lines, []
+        return lines
+
+    def close(self) -> None:
+        self._tail.close()
+
+    def _take(self, text: str) -> None:
+        self._lines += text.splitlines()
+
+
+if __name__ == "__main__":
+    {"dashboard": serve_dashboard, "rerun": feed_rerun}[sys.argv[1]]()

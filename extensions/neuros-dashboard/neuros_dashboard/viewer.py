@@ -1,0 +1,122 @@
+"""Viewers of a run: their interface, their registry, and the choice among them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping
+from typing import Protocol
+
+from neuros.errors import EnvironmentFault
+from neuros.ports import BackEnd, Reaper, Shown
+from neuros.registry import Registry
+
+
+class PreparedViewer(Protocol):
+    """A viewer made ready for one run."""
+
+    def start(self, run: Shown, reaper: Reaper) -> str:
+        """Open it, once there is a control socket; returns what to tell the user, as its address.
+
+        Raises ``EnvironmentFault``.
+        """
+
+    def finish(self) -> None:
+        """Close it with the run, also where it was not started."""
+
+
+class Viewer(ABC):
+    """What shows runs, in a window or a page. An entry point of the group ``neuros.viewers``.
+
+    Attributes:
+        name: in ``--viewer``; that of the entry point.
+        place: where it shows something, as in "in *the dashboard*".
+        ranks: what it shows: the ``graph`` of a run (``--node-graph``), what its ``packets`` say
+            (``--visualisations``). The viewer with the highest number that can be used is taken.
+    """
+
+    name: str
+    place: str
+    ranks: Mapping[str, int] = {}
+
+    @abstractmethod
+    def prepare(self, back_end: BackEnd, subject: str | None, port: int | None) -> PreparedViewer:
+        """Find what it needs to show a run of this back end.
+
+        Args:
+            subject: what it was chosen to show; ``None`` where it was asked for by its name.
+            port: the user's wish, for a viewer that serves a page.
+
+        Raises:
+            EnvironmentFault: if it cannot be used here, in a few words.
+            UsageError: if it cannot have the port.
+        """
+
+
+VIEWERS: Registry[Viewer] = Registry("neuros.viewers", "viewer", Viewer)
+
+
+class Views:
+    """The viewers that a user asks for, made ready.
+
+    Args:
+        back_end: of the run.
+        names: of the viewers that are asked for by name.
+        subjects: what else is to be shown, by the flag that asks for it: each is shown by the best
+            viewer that can be used here.
+        port: for a viewer that serves a page.
+
+    Raises:
+        UsageError: if there is no viewer of a name, or the port is taken.
+        EnvironmentFault: if something cannot be shown, with the reason.
+    """
+
+    def __init__(
+        self,
+        back_end: BackEnd,
+        names: Iterable[str],
+        subjects: Mapping[str, str],
+        port: int | None = None,
+    ) -> None:
+        self._back_end = back_end
+        self._port = port
+        self._views: dict[str, PreparedViewer] = {}
+        self._notices: list[str] = []
+        for flag, subject in subjects.items():
+            self._show(flag, subject)
+        for name in names:
+            if name not in self._views:
+                try:
+                    self._prepare(VIEWERS.load(name), None)
+                except EnvironmentFault as fault:
+                    raise EnvironmentFault(f"viewer {name}: {fault}") from fault
+
+    def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None:
+        """Open windows and pages, once there is a control socket. Raises ``EnvironmentFault``."""
+        for notice in self._notices:
+            log("INFO", notice)
+        for view in self._views.values():
+            log("INFO", view.start(run, reaper))
+
+    def finish(self) -> None:
+        """Close what was opened."""
+        for view in self._views.values():
+            view.finish()
+
+    def _show(self, flag: str, subject: str) -> None:
+        """Prepare the best viewer of a subject."""
+        able = [each for each in map(VIEWERS.load, VIEWERS) if subject in each.ranks]
+        reasons: list[str] = []
+        for viewer in sorted(able, key=lambda each: -each.ranks[subject]):
+            try:
+                self._prepare(viewer, subject)
+            except EnvironmentFault as fault:
+                reasons.append(str(fault))
+                continue
+            if reasons:
+                why = ", and ".join(reasons)
+                self._notices.append(f"{flag}: in {viewer.place}, since {why}")
+            return
+        raise EnvironmentFault(f"{flag}: {', and '.join(reasons)}")
+
+    def _prepare(self, viewer: Viewer, subject: str | None) -> None:
+        self._views[viewer.name] = viewer.prepare(self._back_end, subject, self._port)

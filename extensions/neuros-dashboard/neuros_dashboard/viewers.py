@@ -1,0 +1,3 @@
+"""``neuros.viewers``, of which distributions with viewers import ``neuros.viewers.viewer``."""
+
+__path__: list[str] = []

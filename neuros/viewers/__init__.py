@@ -1,1 +1,0 @@
-"""Viewers of other projects: RViz and Rerun."""

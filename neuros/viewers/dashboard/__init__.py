@@ -1,1 +1,0 @@
-"""Dashboard: a page in the browser that shows a run while it goes on."""
