@@ -106,7 +106,11 @@ class Execution:
             self._domain.release()
             raise
         self._listener = plan.deployment.control_listener(self.folder) or UnixListener(self.folder)
-        self._logs = self._log_files()
+        # By what is to be shown of their origin.
+        self._logs = {f.node.name: self.folder / f.node.name / "node.log" for f in self._files}
+        self._logs |= plan.deployment.logs(self.folder)
+        if self._recording_plan is not None:
+            self._logs["recorder"] = log_of(self.folder)
         self._console = Console(
             stream,
             self._logs,
@@ -115,15 +119,6 @@ class Execution:
             self._as_here,
             shows_progress=plan.request.progress,
         )
-
-    def _log_files(self) -> dict[str, Path]:
-        """The log files, by what is to be shown of their origin."""
-        names = [file.node.name for file in self._files]
-        logs = {name: self.folder / name / "node.log" for name in names}
-        logs |= self._plan.deployment.logs(self.folder)
-        if self._recording_plan is not None:
-            logs["recorder"] = log_of(self.folder)
-        return logs
 
     @property
     def output_failure(self) -> OSError | None:
@@ -168,7 +163,10 @@ class Execution:
             self._console.log("INFO", self._how_to_look())
             for severity, notice in self._plan.notices:
                 self._console.log(severity, notice)
-            recording = self._recording(reaper)
+            if self._recording_plan is not None:
+                recording = Recording(
+                    self._recording_plan, self._run_id, self.folder, self._beside(), reaper
+                )
             supervisor = self._supervisor(reaper)
             outcome = supervisor.outcome
             duration = self._plan.request.end
@@ -233,11 +231,6 @@ class Execution:
         if self._plan.request.isolate:
             return own
         return f"{own}, or ROS_DOMAIN_ID={self._domain.id} ros2 topic list"
-
-    def _recording(self, reaper: Reaper) -> Recording | None:
-        if self._recording_plan is None:
-            return None
-        return Recording(self._recording_plan, self._run_id, self.folder, self._beside(), reaper)
 
     def _shown(self) -> Shown:
         plan = self._plan
@@ -343,10 +336,12 @@ class Execution:
 
     def _environment(self) -> dict[str, str]:
         """The environment of every node; it overrides what the shell has sourced."""
+        is_in_notebook = os.environ.get("MPLBACKEND", "").startswith("module://")
         return {
             **self._plan.network.environment(os.environ),
             ELSEWHERE_VARIABLE: ",".join(self._plan.elsewhere),
-            **_without_notebook(os.environ),
+            # What a notebook has Matplotlib draw with is in the notebook, and in no node.
+            **({"MPLBACKEND": ""} if is_in_notebook else {}),
             "NEUROS_RUN_ID": self._run_id,
             "ROS_DOMAIN_ID": str(self._domain.id),
             "ROS_LOG_DIR": str(self.folder),
@@ -380,12 +375,6 @@ def _check_reach(recording: RecordingPlan | None) -> None:
             f"--isolate: the recorder cannot hear {', '.join(recording.listen)} in the network of"
             " the containers: --exclude these topics, or use --backend process"
         )
-
-
-def _without_notebook(environ: Mapping[str, str]) -> dict[str, str]:
-    """What a notebook has Matplotlib draw with is in the notebook, and in no node."""
-    is_inline = environ.get("MPLBACKEND", "").startswith("module://")
-    return {"MPLBACKEND": ""} if is_inline else {}
 
 
 def run_domain(plan: Plan, recording: RecordingPlan | None) -> DomainLock:

@@ -46,9 +46,9 @@ def add_launch(launch: argparse.ArgumentParser) -> None:
 
 
 def prepare_launch(launch: argparse.ArgumentParser, arguments: Sequence[str]) -> None:
-    """Add the options of the back end that the arguments name, and of extensions that they need.
+    """Add the options of the back end that the arguments name, and of extensions if they need any.
 
-    For ``--help``, and where a shell completes, those of all.
+    For ``--help``, add those of all.
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--backend", nargs="?")
@@ -66,7 +66,7 @@ def prepare_launch(launch: argparse.ArgumentParser, arguments: Sequence[str]) ->
         add_options(group, [replace(each, group="") for each in back_end.options])
     flags = {word.partition("=")[0] for word in arguments if word.startswith("-")}
     unknown = flags - {*launch._option_string_actions}
-    if unknown or asked.help or "_ARGCOMPLETE" in os.environ:  # to find them takes some 10 ms
+    if unknown or asked.help:  # to find them takes some 10 ms
         extensions = [*dict.fromkeys(LAUNCH.load(flag) for flag in LAUNCH)]
         for extension in extensions:
             add_options(launch, extension.options)

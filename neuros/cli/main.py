@@ -244,10 +244,11 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
         if is_whole:
             module = import_module(each.module)
             getattr(module, f"add_{name.replace('-', '_')}")(added)
-            added.prepare = getattr(module, f"prepare_{name}", None)
-            if command is None and added.prepare is not None:
-                added.prepare(added, ["--help"])
-                added.prepare = None
+            prepare = getattr(module, f"prepare_{name}", None)
+            if prepare is not None and (command is None or "_ARGCOMPLETE" in os.environ):
+                prepare(added, ["--help"])  # argcomplete does not see options that come later
+            else:
+                added.prepare = prepare
     return result
 
 

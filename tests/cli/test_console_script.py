@@ -72,8 +72,9 @@ def test_launching_spares_the_restart_that_the_ros_wheels_would_make(tmp_path: P
     ("line", "fitting"),
     [
         ("neuros la", {"launch"}),
-        ("neuros view", set()),  # that is started by NeuROS itself
+        ("neuros rec", set()),  # the recorder is started by NeuROS itself
         ("neuros launch --backend in", {"in-process"}),
+        ("neuros launch --viewer r", {"rerun", "rqt_graph", "rviz2"}),
         ("neuros stop --", {"--help", "--all"}),
         ("./launch.py --no-", {"--no-placement", "--no-progress"}),
     ],

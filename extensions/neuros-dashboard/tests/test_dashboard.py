@@ -139,7 +139,7 @@ def test_nobody_gets_in_without_the_token_or_from_another_page(tmp_path: Path) -
         assert visitor.get("/", Host="neuros.example.org") == 403
         assert visitor.get("/", Host=netloc.replace("127.0.0.1", "localhost")) == 200
         assert visitor.get_as_it_is("/static/vendor/../main.js") == 200
-        for up in ("..", "%2e%2e", "..%2f..%2fdashboard", "vendor/../.."):
+        for up in ("..", "%2e%2e", "..%2f..%2fneuros_dashboard", "vendor/../.."):
             assert (STATIC / unquote(up) / "server.py").is_file()
             assert visitor.get_as_it_is(f"/static/{up}/server.py") == 404, up
         assert visitor.get_as_it_is("/static//etc/passwd") == 404
