@@ -28,23 +28,31 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
+<<<<<<< HEAD
     hold("lines of neuros/", lines(NEUROS), 51_721)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
     hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 61_402)
+=======
+    hold("lines of neuros/", lines(NEUROS), 50_690)
+
+
+def test_lines_of_the_core_and_its_extensions() -> None:
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 62_515)
+>>>>>>> c9fdcf58 (Sizes after the dashboard has left the core; the faults find its program)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 78_599)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 78_005)
 
 
 def test_private_functions_that_are_used_once() -> None:
-    hold("percent of the functions of neuros/", used_once_percent(NEUROS), 12.9)
+    hold("percent of the functions of neuros/", used_once_percent(NEUROS), 12.1)
 
 
 def test_public_classes_of_one_name() -> None:
-    hold("names in several modules", classes_in_several_modules(NEUROS), 35)
+    hold("names in several modules", classes_in_several_modules(NEUROS), 29)
 
 
 @pytest.fixture(scope="module")

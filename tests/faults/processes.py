@@ -171,7 +171,7 @@ def _pid_of(target: str, trial: Trial) -> int:
 def _is_target(process: psutil.Process, target: str) -> bool:
     if target == "reaper":
         return "NEUROS_GUARDED_RUN" in process.environ()
-    return [*process.cmdline()[3:5]] == ["neuros.cli", target]
+    return process.cmdline()[4:5] == [target]
 
 
 def _await_no_containers(folder: Path, engine: OwnEngine) -> None:
