@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
 from neuros.distribution import python_command
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, Problem
 from neuros.options import Option
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port, Project
 from neuros.stacks import ProcessThreads
@@ -761,6 +761,21 @@ class SweepExecutor(ABC):
             UsageError: for a place or a count that makes no sense.
             EnvironmentFault: if something is missing, or does not answer.
         """
+
+
+class PluginCheck(ABC):
+    """Checks nodes before a run. An entry point of the group ``neuros.plugin_checks``.
+
+    Its name is that of a module, the plugin of these nodes.
+    """
+
+    @abstractmethod
+    def problems(self, node: Node) -> Iterable[Problem]:
+        """What keeps the node from running."""
+
+    @abstractmethod
+    def doubts(self, node: Node) -> Iterable[Problem]:
+        """What may not be meant so, or cannot be checked here."""
 
 
 class BackEnd(ABC):

@@ -18,12 +18,13 @@ Of back ends, ``--backend`` chooses one here (:func:`choose`).
 from __future__ import annotations
 
 import importlib
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.abc import Loader
+from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from importlib.util import spec_from_loader
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, TypeVar, cast
@@ -37,6 +38,7 @@ from neuros.ports import (
     LaunchExtension,
     ModelFormat,
     Notice,
+    PluginCheck,
     Subcommand,
     SweepExecutor,
     TransportKind,
@@ -95,6 +97,11 @@ class Registry(Generic[Part]):
             self._loaded[name] = self._load(name)
         return self._loaded[name]
 
+    def value(self, name: str) -> str:
+        """What is loaded for a name, ``module:attribute`` or a module; empty if there is none."""
+        entry = self._own.get(name) or self._others.get(name)
+        return entry.value if entry else ""
+
     def missing(self, name: str) -> str:
         """What to install for a part that one of NeuROS's extensions has; empty for others."""
         extension = dict(_rows(EXTENSIONS, self._group)).get(name)
@@ -118,6 +125,8 @@ class Registry(Generic[Part]):
             )
         try:
             part = entry.load()
+        except EnvironmentFault:  # it says itself what it lacks
+            raise
         except Exception as error:  # whatever a module of another distribution may raise
             raise self._fault(name, entry, f"cannot be loaded: {error!r}") from error
         if not isinstance(part, self._kind):
@@ -182,20 +191,31 @@ MODELS: Registry[ModelFormat] = Registry(
 EXECUTORS: Registry[SweepExecutor] = Registry("neuros.executors", "executor", SweepExecutor)
 BAG_FORMATS: Registry[Callable[..., Any]] = Registry("neuros.bag_formats", "format", object)
 """What methods of recorded topics and runs return in the types of other libraries."""
+PLUGIN_CHECKS: Registry[PluginCheck] = Registry("neuros.plugin_checks", "plugin", PluginCheck)
 
 
-class _Alias(Loader):
-    """Lets a module of an extension be imported under its name in ``neuros``, too."""
+class _Alias(Loader, MetaPathFinder):
+    """Lets a module of an extension be imported under its name in ``neuros``, too.
 
-    def __init__(self, module: ModuleType) -> None:
-        self._module = module
-        self._spec = module.__spec__
+    For a package it is also the finder of its modules: others would load those a second time.
+    """
+
+    def __init__(self, name: str, module: str) -> None:
+        self._name, self._module = name, module
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        return self._module
+        module = importlib.import_module(self._module)
+        self._spec = module.__spec__
+        return module
 
     def exec_module(self, module: ModuleType) -> None:
         module.__spec__ = self._spec  # the import has put its own there
+        if hasattr(module, "__path__"):
+            sys.meta_path.insert(0, self)
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
+        inner = fullname.removeprefix(f"{self._name}.")
+        return spec_of_alias(fullname, f"{self._module}.{inner}") if inner != fullname else None
 
 
 def spec_of_name(name: str) -> ModuleSpec | None:
@@ -207,8 +227,19 @@ def spec_of_name(name: str) -> ModuleSpec | None:
     inner = name.partition(".")[2]
     if missing := NAMES.missing(inner):
         raise ModuleNotFoundError(missing, name=name)
-    module = NAMES.load(inner) if inner in NAMES else None
-    return spec_from_loader(name, _Alias(module)) if isinstance(module, ModuleType) else None
+    value = NAMES.value(inner)
+    return spec_of_alias(name, value) if value and ":" not in value else None
+
+
+def spec_of_alias(name: str, module: str) -> ModuleSpec | None:
+    """The spec of a module under a second name; it is not loaded again, nor before it is needed."""
+    found = find_spec(module)
+    if found is None:
+        return None
+    spec = ModuleSpec(name, _Alias(name, module), origin=found.origin)
+    spec.has_location = found.has_location
+    spec.submodule_search_locations = found.submodule_search_locations
+    return spec
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,6 @@ REACHED = {
 # By the beginning of a test's path and name: what is reached through neuros, and what takes long.
 BY_NAME = {
     "ros": (
-        "api/test_gym_environments.py",
         "api/test_python_api.py",
         "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
@@ -56,8 +55,9 @@ BY_NAME = {
         "conformance/test_conformance.py::test_further_random_projects",
         "conformance/test_conformance.py::test_random_projects",
         "conformance/test_conformance.py::test_what_once",
+        "extensions/neuros-learn/tests/test_datasets.py",
+        "extensions/neuros-learn/tests/test_gym_environments.py",
         "integration/",
-        "recording/test_datasets.py",
         "upgrades/test_upgrades.py",
     ),
     "process": (

@@ -4,24 +4,34 @@ from __future__ import annotations
 
 import ast
 import configparser
+import json
 import re
 import subprocess
 import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from typing import Any
 
 import pytest
 from test_architecture import imports_of
 
+from neuros.api.loading import load_with_messages
 from neuros.cli.main import main
 from neuros.distribution import __version__, libraries
-from neuros.errors import UsageError
-from neuros.ports import DeploymentKind, ModelFormat
+from neuros.errors import ProjectError, UsageError
+from neuros.ports import DeploymentKind, ModelFormat, PluginCheck
 from neuros.registry import EXTENSIONS, Registry
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = sorted((ROOT / "extensions").glob("neuros-*"))
 CORE = sorted((ROOT / "neuros").rglob("*.py"))
+PLUGIN = """
+from neuros.hooks import neuros_tick
+
+@neuros_tick(seconds=1)
+def tick(node):
+    pass
+"""
 each_extension = pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 
 
@@ -140,6 +150,33 @@ def test_a_launch_without_options_of_extensions_looks_for_none(
     assert "nowhere" in capsys.readouterr().err
 
 
+def test_so_is_that_of_a_plugin_and_of_what_a_plugin_imports(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda group: [])
+    names: Registry[Any] = Registry("neuros.names", "name in neuros", object)
+    checks: Registry[PluginCheck] = Registry("neuros.plugin_checks", "plugin", PluginCheck)
+    monkeypatch.setattr("neuros.registry.NAMES", names)
+    monkeypatch.setattr("neuros.api.loading.NAMES", names)
+    monkeypatch.setattr("neuros.api.loading.PLUGIN_CHECKS", checks)
+    (tmp_path / "net.nir").touch()
+    node = {"name": "brain", "container": "neuros_nir", "network": "net.nir"}
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [node]}), "utf-8")
+    with pytest.raises(ProjectError) as caught:
+        load_with_messages(tmp_path)
+    (problem,) = caught.value.problems
+    assert problem.pointer == "/nodes/0/network"
+    assert "is in the extension neuros-learn, which is not installed: " in problem.text
+
+    node = {"name": "brain", "container": "neuros_python", "plugin": "brain.py"}
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [node]}), "utf-8")
+    (tmp_path / "brain.py").write_text(f"import neuros.datasets\n{PLUGIN}", "utf-8")
+    monkeypatch.delitem(sys.modules, "neuros.datasets", raising=False)
+    (warning,) = load_with_messages(tmp_path)[0].warnings
+    assert warning.text == "there is no module 'neuros.datasets'"
+    assert "is in the extension neuros-learn, which is not installed: " in warning.hint
+
+
 def test_a_python_elsewhere_finds_extensions_where_the_core_says(tmp_path: Path) -> None:
     for name, folder in libraries().items():
         (tmp_path / name).symlink_to(folder, target_is_directory=True)
@@ -157,12 +194,15 @@ def test_a_python_elsewhere_finds_extensions_where_the_core_says(tmp_path: Path)
 
 @pytest.fixture
 def lab(tmp_path: Path) -> Path:
-    """A distribution with a module and a function that are to be found in ``neuros``."""
+    """A distribution whose module, function and package are to be found in ``neuros``."""
     (tmp_path / "lab.py").write_text("def greet():\n    return 'hello'\n", "utf-8")
     metadata = tmp_path / "lab-1.0.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n", "utf-8")
-    names = "[neuros.names]\nlab = lab\ngreet = lab:greet\n"
+    (tmp_path / "kit").mkdir()
+    (tmp_path / "kit" / "__init__.py").touch()
+    (tmp_path / "kit" / "arm.py").write_text("import kit\n", "utf-8")
+    names = "[neuros.names]\nlab = lab\ngreet = lab:greet\nsnn.kit = kit\n"
     (metadata / "entry_points.txt").write_text(names, "utf-8")
     return tmp_path
 
@@ -185,6 +225,22 @@ def test_a_module_of_an_extension_is_imported_from_neuros(lab: Path) -> None:
         "print(greet(), neuros.lab is lab, lab.__spec__.name)"
     )
     assert output_of(program, lab) == "hello True lab\n"
+
+
+def test_a_module_of_its_package_is_loaded_once_whatever_it_is_called(lab: Path) -> None:
+    program = (
+        "import neuros.snn.kit.arm as first, kit.arm as second; from neuros.snn.kit import arm\n"
+        "print(first is second is arm, first.__name__)"
+    )
+    assert output_of(program, lab) == "True kit.arm\n"
+
+
+def test_where_a_module_is_can_be_told_without_importing_it(lab: Path) -> None:
+    program = (
+        "import sys; from neuros.project.paths import find_module\n"
+        "print(find_module('neuros.snn.kit.arm'), 'kit.arm' in sys.modules)"
+    )
+    assert output_of(program, lab) == f"{lab}/kit/arm.py False\n"
 
 
 def test_so_is_a_function(lab: Path) -> None:

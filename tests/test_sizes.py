@@ -28,19 +28,11 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-<<<<<<< HEAD
     hold("lines of neuros/", lines(NEUROS), 51_721)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
     hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 61_402)
-=======
-    hold("lines of neuros/", lines(NEUROS), 50_690)
-
-
-def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 62_515)
->>>>>>> c9fdcf58 (Sizes after the dashboard has left the core; the faults find its program)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:

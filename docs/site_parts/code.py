@@ -14,7 +14,6 @@ from sphinx.application import Sphinx
 from site_parts import uml
 from site_parts.words import as_text, cell
 
-PLUGINS = {"neuros.snn.nir.plugin"}  # can be imported in the environment of a node only
 _ROLE = re.compile(r":\w+:`~?")
 
 
@@ -26,7 +25,7 @@ def packages(root: Path) -> dict[str, list[str]]:
             path = file.relative_to(root).with_suffix("")
             package = ".".join(path.parent.parts)
             found[package].append(package if path.name == "__init__" else ".".join(path.parts))
-    return {package: sorted({*found[package]} - PLUGINS) for package in sorted(found)}
+    return {package: sorted(found[package]) for package in sorted(found)}
 
 
 def pages(root: Path) -> Iterator[tuple[str, str]]:

@@ -19,19 +19,20 @@ from neuros.api.plan import make_environments
 from neuros.backends.containers import BASE, OWN_FOLDER, find_container, why_no_container
 from neuros.backends.node_command import signal_in_words, without_mark
 from neuros.backends.pythons import Pythons
-from neuros.distribution import WORKSPACE, install_command, python_command
+from neuros.distribution import WORKSPACE, python_command
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.project.load import Loaded, load_project
 from neuros.project.loops import Loops, modules_beside
 from neuros.project.message_types import unknown_type
-from neuros.project.model import NETWORK, NETWORK_MODULE, Node, Project
+from neuros.project.model import NETWORK_MODULE, Node, Project
 from neuros.project.paths import is_missing, modules_here, why_no_module
 from neuros.project.plugin_files import PluginFile, read_plugin
 from neuros.project.scanner import display_name, problem_in
 from neuros.project.suggest import did_you_mean
 from neuros.recording.provenance import seeds
+from neuros.registry import NAMES, PLUGIN_CHECKS
 
 _LONG_BYTES = 1 << 20
 """A file of a container's folder from this size on is data, not a recipe."""
@@ -72,13 +73,20 @@ def load_with_messages(
     messages = Messages.of_nodes(loaded.project.nodes, workspaces)
     if problems := messages.problems():
         raise ProjectError(problems)
-    nodes = loaded.project.nodes if reads_plugins else ()
-    if problems := [problem for node in nodes for problem in _network_problems(node)]:
-        raise ProjectError(problems)
+    nodes = [node for node in loaded.project.nodes if node.module]
+    checks = [(n, PLUGIN_CHECKS.load(n.module)) for n in nodes if n.module in PLUGIN_CHECKS]
+    if reads_plugins:
+        for node in nodes:
+            if text := PLUGIN_CHECKS.missing(node.module):
+                key = "network" if node.module == NETWORK_MODULE else "plugin"
+                problems.append(problem_in(node.file, f"{node.pointer}/{key}", text))
+        problems += [problem for node, check in checks for problem in check.problems(node)]
+        if problems:
+            raise ProjectError(problems)
     doubts = (
         *_unknown_types(loaded, workspaces),
         *_unknown_plugins(loaded),
-        *_network_doubts(loaded),
+        *(doubt for node, check in checks for doubt in check.doubts(node)),
         *(foreseen_failures(loaded.project, messages, looks_beside=False) if reads_plugins else ()),
     )
     return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
@@ -133,30 +141,6 @@ def _unknown_plugins(loaded: Loaded) -> Iterator[Problem]:
                 text, _ = why_no_module(node.module)
                 hint = f"nothing in {container.folder} names '{package}'"
                 yield problem_in(node.file, f"{node.pointer}/plugin", text, hint)
-
-
-def _network_problems(node: Node) -> Iterator[Problem]:
-    """What is wrong with the network of a node, as far as this Python can read it."""
-    if node.module == NETWORK_MODULE and find_spec("h5py"):
-        from neuros.snn.nir.network import problems_of
-
-        for text in problems_of(node, Path(node.environment.get(NETWORK, ""))):
-            yield _at_network(node, text)
-
-
-def _network_doubts(loaded: Loaded) -> Iterator[Problem]:
-    for node in loaded.project.nodes:
-        if node.module == NETWORK_MODULE and not find_spec("h5py"):
-            hint = f"h5py is not installed: {install_command('nir')}"
-            yield _at_network(node, "the network cannot be checked before the run", hint)
-        if node.module == NETWORK_MODULE and "exporter" not in node.parameters:
-            text = "is stepped by NIR's own equations, but the library that wrote it may use others"
-            hint = 'name that library: "parameters": {"exporter": "snntorch"}, see docs/nir.md'
-            yield _at_network(node, text, hint)
-
-
-def _at_network(node: Node, text: str, hint: str = "") -> Problem:
-    return problem_in(node.file, f"{node.pointer}/network", text, hint)
 
 
 def _names_package(folder: Path, package: str) -> bool:
@@ -229,7 +213,8 @@ def _lacking(
                 if is_named and is_missing(top, folders):
                     continue
                 text = f"there is no module '{needed.name}'"
-                hint = _place_of_module(top, node)
+                missing = NAMES.missing(needed.name.removeprefix("neuros."))
+                hint = missing or _place_of_module(top, node)
             if text:
                 place = needed.line, needed.column
                 yield Problem(display_name(part.path), *place, "", text, hint)

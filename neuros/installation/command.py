@@ -36,7 +36,7 @@ from neuros.installation.packages import (
 )
 from neuros.installation.progress import Progress
 
-STANDARD_EXTRAS = ("mujoco", "nest", "plot", "analysis", "cluster", "dashboard", "robots")
+STANDARD_EXTRAS = ("mujoco", "nest", "plot", "analysis", "cluster", "dashboard", "learn", "robots")
 DEVELOPER_EXTRAS = ("dev", "docs")
 _PROOF_TIMEOUT_S = 180.0
 

@@ -12,6 +12,7 @@ import shutil
 import stat
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.machinery import ModuleSpec, PathFinder
 from itertools import accumulate
@@ -212,7 +213,9 @@ def _specs(name: str) -> list[ModuleSpec | None]:
         path = within.submodule_search_locations if within else None
         is_lost = bool(found) and path is None
         specs = (finder.find_spec(each, path) for finder in sys.meta_path)
-        found.append(None if is_lost else next(filter(None, specs), None))
+        found.append(None)
+        with suppress(ModuleNotFoundError):  # of an extension of NeuROS that is not installed
+            found[-1] = None if is_lost else next(filter(None, specs), None)
     return found
 
 

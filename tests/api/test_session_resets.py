@@ -9,11 +9,12 @@ from pathlib import Path
 
 import pytest
 from api_projects import COUNTER, ENDLESS, THROWER, dice
+from cart_project import BRAIN, ROBOT, cart
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from std_msgs.msg import Float64
 from test_python_api import thrown
-from test_stepped_sessions import ACCEPTANCE, BRAIN, DEADLINE_S, EVERY_BACK_END, ROBOT, cart, poses
+from test_stepped_sessions import ACCEPTANCE, DEADLINE_S, EVERY_BACK_END, poses
 
 import neuros
 from containers import require_containers, wait_until

@@ -20,6 +20,7 @@ from typing import Any
 import psutil
 import pytest
 from api_projects import ENDLESS, THROWER, dice
+from cart_project import BRAIN, cart, port
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from std_msgs.msg import Float64, String, UInt8MultiArray
@@ -61,28 +62,6 @@ DEADLINE_S = 60.0
 EYES = "thrower.eyes"
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "sessions.md"
 
-ROBOT = """
-from neuros.hooks import neuros_function, Optional
-
-@neuros_function(inputs=Optional("push"), outputs=["pose", "clock"])
-def step(node, push):
-    place, steps = node.get_user_data() or (1.0, 0)
-    if push is not None:
-        place += push.data
-    steps += 1
-    node.set_user_data((place, steps))
-    pose, clock = node.make_packet("pose"), node.make_packet("clock")
-    pose.data = place
-    clock.clock.sec, clock.clock.nanosec = divmod(steps * 10_000_000, 10**9)
-    return pose, clock
-
-@neuros_function(inputs="wheels")
-def steer(node, wheels):
-    if wheels.data == 13.0:
-        raise RuntimeError("a wheel has broken")
-    place, steps = node.get_user_data() or (1.0, 0)
-    node.set_user_data((place + wheels.data, steps))
-"""
 ECHO = """
 import time
 from neuros.hooks import neuros_function, Optional
@@ -167,47 +146,6 @@ def step(node):
     clock.clock.sec, clock.clock.nanosec = divmod(part * 10**9 // 300, 10**9)
     return clock
 """
-BRAIN = """
-from neuros.hooks import neuros_function
-
-@neuros_function(inputs="pose", outputs="command")
-def decide(node, pose):
-    command = node.make_packet("command")
-    command.data = -0.5 * pose.data
-    return command
-"""
-
-
-def port(name: str, kind: str = "std_msgs/msg/Float64") -> dict[str, str]:
-    return {"name": name, "type": kind}
-
-
-def cart(folder: Path) -> Path:
-    """A robot that drives the project, and a brain that brings it back to 0."""
-    made = folder / "cart"
-    made.mkdir()
-    (made / "robot.py").write_text(ROBOT)
-    (made / "brain.py").write_text(BRAIN)
-    robot = {
-        "name": "robot",
-        "plugin": "robot.py",
-        "inputs": [port("wheels"), port("push")],
-        "outputs": [port("pose"), port("clock", "rosgraph_msgs/msg/Clock")],
-    }
-    brain = {
-        "name": "brain",
-        "plugin": "brain.py",
-        "inputs": [port("pose")],
-        "outputs": [port("command")],
-    }
-    wires = [("robot", "pose", "brain", "pose"), ("brain", "command", "robot", "wheels")]
-    keys = ("source_node", "source_output", "destination_node", "destination_input")
-    project = {
-        "nodes": [{**node, "container": "neuros_python"} for node in (robot, brain)],
-        "connections": [{**dict(zip(keys, w, strict=True)), "discard_limit": 0} for w in wires],
-    }
-    (made / "project.json").write_text(json.dumps(project, indent=1))
-    return made
 
 
 def pondering_cart(folder: Path) -> Path:

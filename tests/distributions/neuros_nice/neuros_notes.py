@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neuros.viewers.viewer import Shown, Viewer
-
 from neuros.ports import BackEnd, Reaper
+from neuros.viewers.viewer import Shown, Viewer
 
 
 class Note:

@@ -11,8 +11,8 @@ import numpy as np
 
 from neuros.errors import NodeError
 from neuros.hooks import neuros_function, neuros_initialise
-from neuros.snn.nir.network import Network, discretisation_of
-from neuros.snn.nir.network_file import read_graph
+from neuros_learn.nir.network import Network, discretisation_of
+from neuros_learn.nir.network_file import read_graph
 
 _GRAPH = read_graph(Path(os.environ["NETWORK"]))
 _INPUTS, _OUTPUTS = _GRAPH.names("Input"), _GRAPH.names("Output")

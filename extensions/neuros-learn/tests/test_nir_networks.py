@@ -13,15 +13,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from neuros_learn.nir import network
+from neuros_learn.nir.network import Network, discretisation_of, problems_of
+from neuros_learn.nir.network_file import NetworkError, read_graph
 
-from neuros.api import loading
 from neuros.api.loading import load_with_messages
 from neuros.backends.docker.back_end import check_modules
 from neuros.errors import ProjectError
 from neuros.project.model import Node, Port
 from neuros.project.split import project_to_json
-from neuros.snn.nir.network import Network, discretisation_of, problems_of
-from neuros.snn.nir.network_file import NetworkError, read_graph
 from neuros.testing import PluginHarness
 
 h5py = pytest.importorskip("h5py", reason="there is none in the lock files for this Python")
@@ -460,7 +460,7 @@ class TestProject:
     def test_without_h5py_here_it_is_left_to_the_node(
         self, project: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(loading, "find_spec", lambda name: None)
+        monkeypatch.setattr(network, "find_spec", lambda name: None)
         (project / "net.nir").write_text("nothing")
         (warning,) = load_with_messages(project)[0].warnings
         assert warning.text == "the network cannot be checked before the run"

@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -19,9 +20,20 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from neuros.project.model import Node, Port
+from neuros.distribution import install_command
+from neuros.errors import Problem
+from neuros.ports import PluginCheck
+from neuros.project.model import NETWORK, Node, Port
+from neuros.project.scanner import problem_in
 from neuros.project.suggest import did_you_mean, listed
-from neuros.snn.nir.network_file import MOST_VALUES, NEURONS, Graph, NetworkError, Part, read_graph
+from neuros_learn.nir.network_file import (
+    MOST_VALUES,
+    NEURONS,
+    Graph,
+    NetworkError,
+    Part,
+    read_graph,
+)
 
 Values: TypeAlias = NDArray[np.float32]
 _Step: TypeAlias = "Callable[[Values], Values]"
@@ -162,6 +174,34 @@ def problems_of(node: Node, path: Path) -> list[str]:
         problems += _port_problems(graph.names("Input"), node.inputs, "input", "Input")
         problems += _port_problems(graph.names("Output"), node.outputs, "output", "Output")
     return problems
+
+
+class _Check(PluginCheck):
+    """Reads the network of a node before a run, as far as this Python can."""
+
+    def problems(self, node: Node) -> Iterator[Problem]:
+        if find_spec("h5py"):
+            for text in problems_of(node, Path(node.environment.get(NETWORK, ""))):
+                yield _at_network(node, text)
+
+    def doubts(self, node: Node) -> Iterator[Problem]:
+        if not find_spec("h5py"):
+            hint = f"h5py is not installed: {install_command('nir')}"
+            yield _at_network(node, "the network cannot be checked before the run", hint)
+        if "exporter" not in node.parameters:
+            text = "is stepped by NIR's own equations, but the library that wrote it may use others"
+            hint = (
+                'name that library: "parameters": {"exporter": "snntorch"}, see'
+                " extensions/neuros-learn/README.md"
+            )
+            yield _at_network(node, text, hint)
+
+
+CHECK = _Check()
+
+
+def _at_network(node: Node, text: str, hint: str = "") -> Problem:
+    return problem_in(node.file, f"{node.pointer}/network", text, hint)
 
 
 def _port_problems(

@@ -15,18 +15,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from cart_project import cart
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from std_msgs.msg import Float64
-from test_stepped_sessions import ACCEPTANCE, cart
 
 import neuros
 import neuros.gym
 from neuros.errors import ProjectError, UsageError
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "examples" / "7_learning" / "cartpole"
-PAGE = ROOT / "docs" / "gymnasium.md"
+PAGE = Path(__file__).resolve().parents[1] / "README.md"
 POSITION, VELOCITY = "cart.joints.position", "cart.joints.velocity"
 OBSERVED = [f"{POSITION}[2]", f"{VELOCITY}[2]"]
 
@@ -97,7 +97,7 @@ def test_an_episode_ends_when_it_is_done_or_long_enough(env: gymnasium.Env[Any, 
     assert ends == 49 * [[False, False]] + [[False, True]]
 
 
-@ACCEPTANCE
+@pytest.mark.acceptance
 def test_the_policy_of_the_project_gives_the_packets_of_its_own_run(
     tmp_path: Path, env: gymnasium.Env[Any, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,7 +119,7 @@ def test_the_policy_of_the_project_gives_the_packets_of_its_own_run(
             s.step()
 
 
-@ACCEPTANCE
+@pytest.mark.acceptance
 class TestVectors:
     def test_side_by_side_in_one_process_and_in_several(self, tmp_path: Path) -> None:
         found = []
@@ -244,7 +244,7 @@ def test_what_cannot_be_is_said_with_what_can(
     assert not (sensors / "runs").exists()
 
 
-@ACCEPTANCE
+@pytest.mark.acceptance
 @NOT_CONNECTED
 def test_a_length_that_messages_do_not_have_is_said_with_that_they_have(sensors: Path) -> None:
     arguments = {"action": "robot.order", "observation": "robot.scan.data[7]", "reward": float}
@@ -256,7 +256,7 @@ def test_a_length_that_messages_do_not_have_is_said_with_that_they_have(sensors:
         env.close()
 
 
-@ACCEPTANCE
+@pytest.mark.acceptance
 @NOT_CONNECTED
 def test_a_project_that_waits_for_a_command_gets_one_at_each_reset(tmp_path: Path) -> None:
     def brain(**others: Any) -> gymnasium.Env[Any, Any]:
@@ -303,7 +303,7 @@ def test_the_code_of_the_page_runs(
     assert "steps" in capsys.readouterr().out
 
 
-@ACCEPTANCE
+@pytest.mark.acceptance
 def test_a_policy_is_learnt_in_two_minutes_and_balances_as_a_node(tmp_path: Path) -> None:
     made = shutil.copytree(EXAMPLE, tmp_path / "cartpole")
     (made / "weights.txt").write_text("0\n0\n0\n0\n")
