@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from email.parser import HeaderParser
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from browser import browser_page
@@ -23,8 +23,9 @@ from PIL import Image, ImageChops
 from visitor import address
 
 from neuros.backends.pythons import find_python
+from neuros.installation.command import DEVELOPER_EXTRAS
 from neuros.installation.machine import NEWEST_FOR_NEST, clean_environment
-from neuros.installation.packages import Installer
+from neuros.installation.packages import LOCKS, Installer
 from neuros.installation.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -33,11 +34,24 @@ SOURCES = ("neuros", *DATA, "tests/integration/back_ends")
 SCREENSHOTS = ROOT / "build" / "screenshots"
 IS_DRAWN = "() => Number(document.querySelector('#world').dataset.drawn ?? 0) > 2"
 FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE")
+LEFT_BEHIND = shutil.ignore_patterns("__pycache__", "runs", "build", "*.egg-info")
+EXTENSIONS = sorted(ROOT.glob("extensions/*"))
 PYTHONS = [(3, minor) for minor in range(10, NEWEST_FOR_NEST[1] + 1)]
 _DIGESTS = """
 from neuros.backends.containers import OWN_FOLDER, find_recipe, names_in
 print({name: find_recipe(name).digest for name in names_in(OWN_FOLDER)})
 """
+
+
+class Extension(NamedTuple):
+    """Its folder in the checkout, and its wheel."""
+
+    folder: Path
+    wheel: Path
+
+    @property
+    def package(self) -> str:
+        return self.folder.name.replace("-", "_")
 
 
 def files_in(folder: Path) -> Iterator[str]:
@@ -71,10 +85,15 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with an sdist, made of a copy of the checkout, and a wheel, made of the sdist."""
     folder = tmp_path_factory.mktemp("package")
     for name in SOURCES:
-        skipped = shutil.ignore_patterns("__pycache__", "runs")
-        shutil.copytree(ROOT / name, folder / "copy" / name, symlinks=True, ignore=skipped)
+        shutil.copytree(ROOT / name, folder / "copy" / name, symlinks=True, ignore=LEFT_BEHIND)
     for name in FILES:
         shutil.copy(ROOT / name, folder / "copy")
+    build(folder)
+    return folder
+
+
+def build(folder: Path) -> Path:
+    """Make an sdist of the distribution in ``copy``, unpack it as ``sdist``, and make its wheel."""
     for kind, place in (("sdist", "copy"), ("wheel", "sdist")):
         code = f"import setuptools.build_meta as b; b.build_{kind}({str(folder)!r})"
         run(sys.executable, "-c", code, cwd=folder / place, environ=os.environ)
@@ -83,13 +102,26 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 opened.extractall(folder, **EXTRACTION)
             archive.with_name(archive.name.removesuffix(".tar.gz")).rename(folder / "sdist")
             archive.unlink()
-    return folder
+    return wheel_in(folder)
+
+
+def wheel_in(folder: Path) -> Path:
+    (file,) = folder.glob("*.whl")
+    return file
 
 
 @pytest.fixture(scope="module")
 def wheel(built: Path) -> Path:
-    (file,) = built.glob("*.whl")
-    return file
+    return wheel_in(built)
+
+
+@pytest.fixture(scope="module", params=EXTENSIONS, ids=lambda folder: folder.name)
+def extension(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Extension:
+    folder = tmp_path_factory.mktemp(request.param.name)
+    shutil.copytree(request.param, folder / "copy", ignore=LEFT_BEHIND)
+    return Extension(request.param, build(folder))
 
 
 class TestWheel:
@@ -115,6 +147,13 @@ class TestWheel:
             assert shown[key]
         assert "Operating System :: POSIX :: Linux" in shown.get_all("Classifier", [])
         assert shown["Description-Content-Type"] == "text/markdown"
+
+
+def test_the_wheel_of_an_extension_has_every_file_of_its_package(extension: Extension) -> None:
+    with zipfile.ZipFile(extension.wheel) as opened:
+        there = {name for name in opened.namelist() if ".dist-info/" not in name}
+    package = extension.package
+    assert there == {f"{package}/{name}" for name in files_in(extension.folder / package)}
 
 
 @pytest.fixture(scope="module")
@@ -240,3 +279,30 @@ def test_three_commands_lead_to_a_robot_that_moves(
         run("neuros", "example", example, cwd=tmp_path, environ=environ)
         run("neuros", "launch", example, "--duration", "2", cwd=tmp_path, environ=environ)
     run("neuros", "doctor", cwd=tmp_path, environ=environ)
+
+
+@pytest.mark.acceptance
+def test_the_tests_of_an_extension_pass_beside_the_wheel_of_the_core_alone(
+    extension: Extension, wheel: Path, tmp_path: Path
+) -> None:
+    """In an environment with all third parties that developers have, and no other extension."""
+    environ, made = clean_environment(os.environ), tmp_path / "venv"
+    environ.pop("VIRTUAL_ENV", None)
+    run(sys.executable, "-m", "venv", made, cwd=tmp_path, environ=environ)
+    python, progress = made / "bin" / "python", Progress(sys.stdout)
+    installer = Installer(python, made, tmp_path / "log", progress, environ)
+    for names in (["build"], ["core", "mujoco", "nest", "plot", *DEVELOPER_EXTRAS]):
+        locks = [word for name in names for word in ("-r", f"{ROOT}/{LOCKS}/{name}.txt")]
+        installer.install(["--no-build-isolation", "--require-hashes", "--no-deps", *locks])
+    installer.install(["--no-deps", str(wheel), str(extension.wheel)])
+
+    copy = tmp_path / "checkout"  # without neuros/
+    for part in ("tests", "examples", f"extensions/{extension.folder.name}"):
+        shutil.copytree(ROOT / part, copy / part, symlinks=True, ignore=LEFT_BEHIND)
+    shutil.rmtree(copy / "extensions" / extension.folder.name / extension.package)
+    for name in ("conftest.py", "pyproject.toml"):
+        shutil.copy(ROOT / name, copy)
+    code = f"import neuros, {extension.package} as other; print(neuros.__file__, other.__file__)"
+    for place in run(python, "-c", code, cwd=copy, environ=environ).split():
+        assert Path(place).is_relative_to(made)
+    print(run(python, "-m", "pytest", "-q", "extensions", cwd=copy, environ=environ))
