@@ -14,18 +14,27 @@ from sphinx.application import Sphinx
 from site_parts import uml
 from site_parts.words import as_text, cell
 
+PLUGINS = {"neuros_learn.nir.plugin"}  # can be imported in the environment of a node only
 _ROLE = re.compile(r":\w+:`~?")
 
 
 def packages(root: Path) -> dict[str, list[str]]:
     """The modules of each package, the package itself first."""
     found: dict[str, list[str]] = defaultdict(list)
-    for file in sorted((root / "neuros").rglob("*.py")):
-        if (file.parent / "__init__.py").exists():
-            path = file.relative_to(root).with_suffix("")
-            package = ".".join(path.parent.parts)
-            found[package].append(package if path.name == "__init__" else ".".join(path.parts))
-    return {package: sorted(found[package]) for package in sorted(found)}
+    for top in ("neuros", *(each.parent.name for each in root.glob("extensions/*/*/__init__.py"))):
+        base = source_of(root, top)
+        for file in (base / top).rglob("*.py"):
+            if (file.parent / "__init__.py").exists():
+                path = file.relative_to(base).with_suffix("")
+                package = ".".join(path.parent.parts)
+                found[package].append(package if path.name == "__init__" else ".".join(path.parts))
+    return {package: sorted({*found[package]} - PLUGINS) for package in sorted(found)}
+
+
+def source_of(root: Path, package: str) -> Path:
+    """The folder that a package is imported from: the checkout, or that of an extension."""
+    extension = root / "extensions" / package.partition(".")[0].replace("_", "-")
+    return extension if extension.is_dir() else root
 
 
 def pages(root: Path) -> Iterator[tuple[str, str]]:
@@ -57,7 +66,7 @@ def leave_out_aliases(
 
 
 def _first_line(root: Path, package: str) -> str:
-    file = root / package.replace(".", "/") / "__init__.py"
+    file = source_of(root, package) / package.replace(".", "/") / "__init__.py"
     text = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
     plain = _ROLE.sub("`", text.partition("\n")[0])
     return cell(as_text(plain).removesuffix("."))
@@ -74,7 +83,8 @@ def _page(root: Path, package: str, modules: list[str]) -> str:
 
 
 def _class_diagram(root: Path, package: str) -> str:
-    text = uml.class_diagram(sorted((root / package.replace(".", "/")).glob("*.py")))
+    folder = source_of(root, package) / package.replace(".", "/")
+    text = uml.class_diagram(sorted(folder.glob("*.py")))
     return f"\n## Class diagram\n\n```mermaid\n{text}\n```\n" if text else ""
 
 
@@ -93,5 +103,5 @@ def _diagrams(root: Path) -> str:
 
 
 def _imports(root: Path, package: str, depth: int) -> str:
-    text = uml.import_diagram(uml.imports_between(root, depth, package))
+    text = uml.import_diagram(uml.imports_between(source_of(root, package), depth, package))
     return f"\n## {package}\n\n```mermaid\n{text}\n```\n"

@@ -66,7 +66,7 @@ COMMANDS = {
     "recorder": Subcommand("neuros.cli.recorder", is_for_people=False),
     "replayed": Subcommand("neuros.cli.replay"),
 }
-"""Of NeuROS itself; :data:`~neuros.registry.SUBCOMMANDS` has those of extensions."""
+"""Of NeuROS itself; ``neuros.registry.SUBCOMMANDS`` has those of extensions."""
 
 
 _WANTED: dict[Any, str] = {

@@ -74,11 +74,14 @@ class TestReference:
     def test_every_module_is_on_the_page_of_its_package(self) -> None:
         text = "".join(pages_of_code().values())
         modules = {
-            ".".join(file.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
-            for file in (ROOT / "neuros").rglob("*.py")
+            ".".join(file.relative_to(base).with_suffix("").parts).removesuffix(".__init__")
+            for base in (ROOT, *ROOT.glob("extensions/*"))
+            for file in base.glob("neuros*/**/*.py")
             if (file.parent / "__init__.py").exists()
         }
         assert len(modules) > 100
+        assert modules >= code.PLUGINS
+        modules -= code.PLUGINS
         assert not [name for name in modules if f".. automodule:: {name}\n" not in text]
 
     def test_every_command_and_its_options_are_shown(self) -> None:

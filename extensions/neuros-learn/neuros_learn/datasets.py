@@ -125,7 +125,7 @@ def minari(
     """Write recorded runs as a dataset of Minari, an episode each, and return it.
 
     The last step gives the observation that ends the episode, which is *truncated*. One name makes
-    a ``Box``, a list a ``Dict`` of boxes, as in :mod:`neuros.gym`. Source of the format: O.
+    a ``Box``, a list a ``Dict`` of boxes, as in :mod:`~neuros_learn.gym`. Source of the format: O.
     Younis et al., "Minari", 2024; the library writes it, to where ``MINARI_DATASETS_PATH`` says.
 
     Args:
