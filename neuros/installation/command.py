@@ -313,6 +313,10 @@ class Environment:
         if not os.access(self._root, os.W_OK):
             remedy = f"sudo chown -R $(id -un) {self._root}"
             raise EnvironmentFault(f"{self._root} cannot be written: {remedy}")
+        # What is left of packages that an update has removed: Python would import the folders.
+        for folder in sorted((self._root / "neuros").rglob("__pycache__"), reverse=True):
+            if all(each.name == "__pycache__" for each in folder.parent.iterdir()):
+                shutil.rmtree(folder.parent)
         version = self.python_version()
         is_new = version is None
         version = version or self._make()

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -88,7 +88,8 @@ class BagWriter:
         self._path, self._custom = path, dict(custom)
         with folder_in(path.parent, path.name) as folder:
             self._file = (folder / f"{path.name}.mcap").open("xb")
-        self._mcap = Writer(self._file)  # chunks of 1 MiB, compressed with Zstandard
+        # Compressing images took 2.7 times the processor time, for 0.6 times the size.
+        self._mcap = Writer(self._file, compression=CompressionType.NONE)
         self._mcap.start("ros2", f"neuros-{__version__}")
         self._types = get_typestore(Stores.ROS2_JAZZY)
         self._schemas: dict[str, int] = {}
