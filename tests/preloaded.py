@@ -25,6 +25,7 @@ _FORKING.set_forkserver_preload(
         "tests.preloaded",
         "jsonschema",
         "numpy.ma",  # numpy.unique() imports it
+        "msgspec",
         "tabulate",
         "xxhash",
         "neuros.cli.launch",

@@ -77,6 +77,7 @@ GENERATORS |= {"rosidl_adapter", "rosidl_cli"}
 # What is not named here has none; a part of a package may have less than the package.
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
+    "control": {"msgspec"},
     "time": {"builtin_interfaces"},
     "transport": {
         "numpy",

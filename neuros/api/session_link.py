@@ -7,7 +7,6 @@ long. It takes no part in such a step; it hears of failures and ends from the no
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -76,7 +75,7 @@ class SessionLink:
     def deliver(self, node: str, input_name: str, content: bytes) -> None:
         """Send a packet, with the next step at the latest."""
         if self._nodes is None or self._is_due:
-            self._supervisor.send(Deliver(node, input_name, base64.b64encode(content).decode()))
+            self._supervisor.send(Deliver(node, input_name, content))
             return
         self._unsent.append((node, input_name, content))
         if len(self._unsent) >= _MOST_UNSENT:
@@ -111,10 +110,7 @@ class SessionLink:
                 stream = connect_unix(self._folder / SESSION_SOCKET_NAME)
                 self._nodes = StepLink(stream, Advanced, "the nodes")
                 self._arrivals.register(stream)
-        packets = {
-            name: (newest.number, base64.b64decode(newest.data))
-            for name, newest in found[0].packets.items()
-        }
+        packets = {name: (newest.number, newest.data) for name, newest in found[0].packets.items()}
         return Advanced(self._number, found[0].sim_times, packets)
 
     def advance(

@@ -12,13 +12,13 @@ import json
 import os
 import signal
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from neuros.backends.console import clean
 from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses, environ_of, started_at
-from neuros.control import Interrupt, Watch
+from neuros.control import TO_OBSERVERS, Interrupt, Watch
 from neuros.control.link import ControlLink, read_as
 from neuros.errors import ControlError, EnvironmentFault
 
@@ -85,7 +85,7 @@ class Session:
         if not self.is_led:
             return
         try:
-            link = ControlLink(connect(self.control), (), "the supervisor")
+            link = ControlLink(connect(self.control), TO_OBSERVERS, "the supervisor")
         except (OSError, EnvironmentFault):
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.launcher[0], signal.SIGINT)
@@ -135,9 +135,7 @@ def _session(described: Mapping[str, Any]) -> Session:
     Raises:
         ControlError: if something lacks, or is of a wrong type.
     """
-    names = {each.name for each in fields(Session)}
-    known = {key: _harmless(each) for key, each in described.items() if key in names}
-    return read_as(Session, known)
+    return read_as(Session, _harmless(described))
 
 
 def _harmless(value: Any) -> Any:

@@ -2,20 +2,21 @@
 
 It is not part of the data path: nodes report once per second, on a change of state and at the end;
 the supervisor answers rarely. Observers (the dashboard) get no more than they ask for. Every
-message is a dataclass of this module; :data:`FROM_NODES`, :data:`TO_NODES`, :data:`FROM_OBSERVERS`
+message is a class of this module; :data:`FROM_NODES`, :data:`TO_NODES`, :data:`FROM_OBSERVERS`
 and :data:`TO_OBSERVERS` say who sends which.
 
-A message is one line: a JSON object with its fields and ``kind``, the name of its class in
-snake_case. The bytes go through any :class:`neuros.ports.ControlStream`; the back end supplies it.
-
-Messages are not frozen: making their classes would take each process twice as long.
+A message travels as MessagePack, behind its length: a map with its fields and ``kind``, the name of
+its class in snake_case. The bytes go through any :class:`neuros.ports.ControlStream`; the back end
+supplies it.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any, TypedDict
+
+import msgspec
 
 from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
@@ -83,8 +84,7 @@ class Metrics(TypedDict):
     accounting: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class LiveCounters:
+class LiveCounters(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Counters and latest times of a node, short enough to be sent often.
 
     Attributes:
@@ -103,8 +103,7 @@ class LiveCounters:
     paused_ns: tuple[tuple[int, int], ...] = ()
 
 
-@dataclass(frozen=True)
-class HookDeclaration:
+class HookDeclaration(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A hook, as its plugin declares it."""
 
     kind: HookKind
@@ -112,23 +111,25 @@ class HookDeclaration:
     outputs: tuple[str, ...] = ()
 
 
-class Message:
+def _kind(name: str) -> str:
+    return re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
+
+
+class Message(msgspec.Struct, tag_field="kind", tag=_kind, forbid_unknown_fields=True):
     """Base of all messages."""
 
 
 # ---------------------------------------------------------------------- from nodes
 
 
-@dataclass
 class Hello(Message):
     """A node process is up; ``plugins``: the file of each node's plugin, as it sees it."""
 
     nodes: tuple[str, ...]
-    plugins: Mapping[str, str] = field(default_factory=dict)
+    plugins: Mapping[str, str] = {}
 
 
-@dataclass(kw_only=True)
-class Report(Message):
+class Report(Message, kw_only=True):
     """State and counters of a node: once per second, on a change of state, at the end.
 
     Attributes:
@@ -154,13 +155,12 @@ class Report(Message):
     metrics: Metrics | None = None
     stack: Stack | None = None
     fault: str | None = None
-    compressed: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    compressed: Mapping[str, tuple[int, int]] = {}
     is_driving: bool = False
     is_final: bool = False
 
 
-@dataclass(kw_only=True)
-class Probed(Report):
+class Probed(Report, kw_only=True):
     """Report of a node between two events, in answer to ``probe``.
 
     Attributes:
@@ -170,26 +170,23 @@ class Probed(Report):
         is_idle: whether no event waits.
     """
 
-    metrics: Metrics = field()  # without the default of a report
+    metrics: Metrics  # without the default of a report
     number: int
     is_startable: bool
     is_wakeable: bool
     is_idle: bool
 
 
-@dataclass
 class Loaded(Message):
     """All plugins of a process are loaded; no hook starts before ``begin``."""
 
 
-@dataclass
 class Ready(Message):
     """A node has initialised as far as it can alone; its other hooks wait for ``activate``."""
 
     node: str
 
 
-@dataclass
 class Hooks(Message):
     """After a plugin was loaded: the hooks that it declares; of finalise hooks the names."""
 
@@ -198,7 +195,6 @@ class Hooks(Message):
     finalise: tuple[str, ...]
 
 
-@dataclass
 class Finalising(Message):
     """A node starts a finalise hook; ``""``: it closes its resources; ``None``: they are closed."""
 
@@ -206,7 +202,6 @@ class Finalising(Message):
     hook: str | None
 
 
-@dataclass
 class Progress(Message):
     """A node is getting on, so it has time again while it finalises; ``text`` of its plugin."""
 
@@ -214,7 +209,6 @@ class Progress(Message):
     text: str = ""
 
 
-@dataclass
 class Shutdown(Message):
     """A plugin has called ``node.shutdown``."""
 
@@ -223,7 +217,6 @@ class Shutdown(Message):
     drain_s: float
 
 
-@dataclass
 class Failed(Message):
     """A node has failed."""
 
@@ -231,7 +224,6 @@ class Failed(Message):
     text: str
 
 
-@dataclass
 class Explanation(Message):
     """Why a node does not move, in answer to ``explain``."""
 
@@ -239,7 +231,6 @@ class Explanation(Message):
     lines: tuple[str, ...]
 
 
-@dataclass
 class Heard(Message):
     """State of another launcher, received from its node; ``None``: that node is gone."""
 
@@ -247,7 +238,6 @@ class Heard(Message):
     text: str | None
 
 
-@dataclass
 class NodeStatus(Message):
     """State and samples of a node, for the observer with this number; in answer to ``look``."""
 
@@ -255,18 +245,16 @@ class NodeStatus(Message):
     asker: int
     sim_time: float | None = None
     counters: LiveCounters | None = None
-    samples: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    samples: Mapping[str, dict[str, Any]] = {}
 
 
-@dataclass
-class NewestPacket:
-    """The newest packet of an output: its number, from 1, and its ROS serialisation in base64."""
+class NewestPacket(msgspec.Struct, forbid_unknown_fields=True):
+    """The newest packet of an output: its number, from 1, and its ROS serialisation."""
 
     number: int
-    data: str
+    data: bytes
 
 
-@dataclass
 class AtRest(Message):
     """No event waits in a node process, and no hook may start: answer to ``settle``.
 
@@ -287,7 +275,6 @@ class AtRest(Message):
     packets: Mapping[str, NewestPacket]
 
 
-@dataclass
 class WasReset(Message):
     """Answer to ``reset``; ``why_not``: why the nodes go on as they are, empty if they do not."""
 
@@ -297,63 +284,52 @@ class WasReset(Message):
 # ---------------------------------------------------------------------- to nodes
 
 
-@dataclass
 class Probe(Message):
     """Report between two events."""
 
     number: int
 
 
-@dataclass
 class Explain(Message):
     """Say why nothing moves."""
 
 
-@dataclass
 class Drain(Message):
     """Stop the hooks that send unasked; ``last_round``: indices of hooks that start once more."""
 
     last_round: Mapping[str, tuple[int, ...]]
 
 
-@dataclass
 class Begin(Message):
     """Initialise: every node of the project is loaded; not sent once the run is stopping."""
 
 
-@dataclass
 class Activate(Message):
     """Start tick and function hooks: every node of the project is ready."""
 
 
-@dataclass
 class Stop(Message):
     """Start no further hook, finalise and end."""
 
 
-@dataclass
 class Say(Message):
     """Publish the state of this launcher to its peers."""
 
     text: str
 
 
-@dataclass
 class Leave(Message):
     """Peers have exchanged all their states: a node that has ended may leave."""
 
 
-@dataclass
 class Pause(Message):
     """Start no further hook."""
 
 
-@dataclass
 class Resume(Message):
     """Go on after a pause."""
 
 
-@dataclass
 class Step(Message):
     """While paused, run ``count`` steps; ``is_driven``: some hooks start without a packet."""
 
@@ -361,7 +337,6 @@ class Step(Message):
     is_driven: bool
 
 
-@dataclass
 class Look(Message):
     """Show an observer what the node does; ``wanted``: what to sample, by node and port."""
 
@@ -369,7 +344,6 @@ class Look(Message):
     asker: int
 
 
-@dataclass
 class Settle(Message):
     """While paused, answer once nothing moves; ``known``: newest known packet number, by output."""
 
@@ -377,52 +351,45 @@ class Settle(Message):
     known: Mapping[str, int]
 
 
-@dataclass
 class Reset(Message):
     """While paused, return to the start and stay paused; ``variables``: environments, by node."""
 
     variables: Mapping[str, Mapping[str, str]]
 
 
-@dataclass
 class Deliver(Message):
-    """A packet of a session for one of its inputs, in base64."""
+    """A packet of a session for one of its inputs."""
 
     node: str
     input: str
-    data: str
+    data: bytes
 
 
 # ---------------------------------------------------------------------- from observers
 
 
-@dataclass
 class Watch(Message):
     """An observer is there."""
 
 
-@dataclass
 class LookAll(Message):
     """Ask every node for its status once; ``wanted``: what to sample, by node and port."""
 
     wanted: Mapping[str, Mapping[str, Any]]
 
 
-@dataclass
 class StepAll(Message):
     """While the run is paused, run ``count`` steps."""
 
     count: int
 
 
-@dataclass
 class End(Message):
     """End the run, drained, with exit code 0."""
 
     reason: str
 
 
-@dataclass
 class Interrupt(Message):
     """Do what Ctrl+C does (``neuros stop``)."""
 
@@ -430,7 +397,6 @@ class Interrupt(Message):
 # ---------------------------------------------------------------------- to observers
 
 
-@dataclass
 class PhaseChanged(Message):
     """Phase of the run, whenever it changes."""
 
@@ -438,7 +404,6 @@ class PhaseChanged(Message):
     is_paused: bool
 
 
-@dataclass
 class Settled(Message):
     """Nothing moves in the whole run; in answer to ``settle``. Fields as in ``at_rest``."""
 
@@ -447,7 +412,6 @@ class Settled(Message):
     packets: Mapping[str, NewestPacket]
 
 
-@dataclass
 class LogRecord(Message):
     """Message of the launcher to the user."""
 
@@ -455,7 +419,6 @@ class LogRecord(Message):
     text: str
 
 
-@dataclass
 class Ended(Message):
     """All nodes have ended.
 

@@ -1,19 +1,40 @@
-"""Ends of the control channel: typed messages, as lines, over a stream of bytes."""
+"""Ends of the control channel: typed messages over a stream of bytes.
+
+Each message is MessagePack behind its length, a ``uint32`` (little-endian).
+"""
 
 from __future__ import annotations
 
 import functools
-import json
 import re
-import types
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, fields, is_dataclass
-from enum import Enum
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
+from collections.abc import Sequence
+from typing import Any, TypeVar, Union
+
+import msgspec
 
 from neuros.control import Message
 from neuros.errors import ControlError
 from neuros.ports import ControlStream
+
+_LENGTH_BYTES = 4
+_LONGEST_BYTES = 1 << 29
+"""Text of another protocol, whose first four bytes count as a length, claims more than this."""
+_READ_BYTES, _MOST_READ_BYTES = 1 << 16, 1 << 20
+_LONGEST_SHOWN = 60
+_PLAIN: tuple[type[Any], ...] = (str, float, int, dict)
+_NO_CHARACTER = re.compile("[\ud800-\udfff]")
+_Declared = TypeVar("_Declared")
+
+
+def _plain(value: Any) -> Any:
+    """A value of a class that derives from a plain one, as NumPy's numbers do, as that."""
+    for kind in _PLAIN:
+        if isinstance(value, kind):
+            return kind(value)
+    raise TypeError(f"{value!r} cannot be sent")
+
+
+to_bytes = msgspec.msgpack.Encoder(enc_hook=_plain).encode
 
 
 class ControlLink:
@@ -33,11 +54,11 @@ class ControlLink:
         self.peer = peer
         self.accept(accepted)
         self.unsent = bytearray()
-        self._parts: list[bytes] = []  # of a line whose end has not arrived
+        self._received = bytearray()  # of a message whose end has not arrived
 
     def accept(self, accepted: Sequence[type[Message]]) -> None:
-        """Take these messages, and no others, from now on."""
-        self._accepted = {kind_of(each): each for each in accepted}
+        """Accept these messages, and no others, from now on."""
+        self._decoder = decoder_of(tuple(accepted))
 
     def fileno(self) -> int:
         """For selectors."""
@@ -45,8 +66,8 @@ class ControlLink:
 
     @property
     def unfinished_bytes(self) -> int:
-        """How much has arrived of a line whose end has not."""
-        return sum(map(len, self._parts))
+        """How much has arrived of a message whose end has not."""
+        return len(self._received)
 
     def send(self, message: Message) -> bool:
         """Send one message; returns False if the other end is gone."""
@@ -77,230 +98,125 @@ class ControlLink:
             ControlError: if one cannot be understood.
         """
         try:
-            lines = self.read_lines()
+            found = self.read()
         except BlockingIOError:
             return []
-        return None if lines is None else [self.decode(line) for line in lines]
+        return None if found is None else [self.decode(data) for data in found]
 
-    def read_lines(self) -> list[bytes] | None:
-        """The whole lines that have arrived, after one read; ``None`` once the other end is gone.
+    def read(self) -> list[bytes] | None:
+        """The whole messages that have arrived, after one read, each without its length.
+
+        Returns ``None`` once the other end is gone.
 
         Raises:
             BlockingIOError: if the stream does not block, and there is nothing to read.
+            ControlError: if what arrives is no control channel at all.
         """
+        size = max(_READ_BYTES, min(_missing_bytes(self._received), _MOST_READ_BYTES))
         try:
-            data = self.stream.recv(1 << 16)
+            data = self.stream.recv(size)
         except BlockingIOError:
             raise
         except OSError:
             return None
         if not data:
             return None
-        end = data.rfind(b"\n")
-        if end < 0:
-            self._parts.append(data)
-            return []
-        lines = b"".join([*self._parts, data[:end]]).split(b"\n")
-        self._parts = [data[end + 1 :]]
-        return lines
+        self._received += data
+        return remove_messages(self._received, self.peer)
 
-    def decode(self, line: bytes) -> Message:
-        """The message of a line. Raises ``ControlError``."""
-        return decode(line, self._accepted, self.peer)
+    def decode(self, data: bytes) -> Message:
+        """A message that :meth:`read` has returned. Raises ``ControlError``."""
+        return decode(data, self._decoder, self.peer)
 
     def close(self) -> None:
         """Hang up."""
         self.stream.close()
 
 
-_NO_CHARACTER = re.compile("[\ud800-\udfff]")
-_LONGEST_SHOWN = 60
-_Declared = TypeVar("_Declared")
-
-
-def kind_of(message: type[Message]) -> str:
-    """The name of a class of messages in the channel: ``first_hook`` of :class:`FirstHook`."""
-    return re.sub(r"(?<!^)(?=[A-Z])", "_", message.__name__).lower()
-
-
 def encode(message: Message) -> bytes:
-    """A message as one line."""
-    content = {"kind": kind_of(type(message)), **vars(message)}
-    text = json.dumps(content, ensure_ascii=False, default=_plain)
-    if not text.isascii():
+    """A message behind its length."""
+    try:
+        data = to_bytes(message)
+    except UnicodeEncodeError:
         # What is no character cannot be written anywhere: both ends see its escape in its place.
-        text = _NO_CHARACTER.sub(lambda match: f"\\\\u{ord(match[0]):04x}", text)
-    return text.encode() + b"\n"
+        data = to_bytes(_escaped(msgspec.to_builtins(message, builtin_types=(bytes,))))
+    return framed(data)
 
 
-def decode(line: bytes, accepted: Mapping[str, type[Message]], peer: str) -> Message:
-    """The message of a line.
-
-    Args:
-        accepted: the messages that may come, by kind.
-        peer: who has sent it.
-
-    Raises:
-        ControlError: if it is none of them, or a field is missing, unknown or of a wrong type.
-    """
-    try:
-        content = json.loads(line)
-        kind = content.pop("kind")
-    except (ValueError, AttributeError, TypeError, KeyError, RecursionError):
-        raise ControlError(
-            f"{peer} sent something that is not a control message: {_shown(line)}"
-        ) from None
-    message = accepted.get(kind) if isinstance(kind, str) else None
-    if message is None:
-        raise ControlError(f"{peer} sent a control message of the unknown kind {_shown(kind)}")
-    try:
-        return read_as(message, content)
-    except ControlError as error:
-        raise ControlError(f"{peer} sent a wrong control message '{kind}': {error}") from None
+def framed(data: bytes) -> bytes:
+    """The bytes of a message behind their length."""
+    return len(data).to_bytes(_LENGTH_BYTES, "little") + data
 
 
-def read_as(declared: type[_Declared], content: Any) -> _Declared:
-    """An object of a dataclass from JSON that somebody else has written.
+def _escaped(value: Any) -> Any:
+    """The value, with escapes of half characters in its texts."""
+    if isinstance(value, str):
+        return _NO_CHARACTER.sub(lambda match: f"\\u{ord(match[0]):04x}", value)
+    if isinstance(value, dict):
+        return {_escaped(key): _escaped(each) for key, each in value.items()}
+    return [*map(_escaped, value)] if isinstance(value, list | tuple) else value
+
+
+def remove_messages(received: bytearray, peer: str) -> list[bytes]:
+    """Remove the whole messages at the start of these bytes, and return them without their lengths.
 
     Raises:
-        ControlError: if a field is missing, unknown or of a wrong type.
+        ControlError: if what follows is no message.
     """
-    read: _Reader = _reader(declared)  # type: ignore[arg-type]
-    try:
-        found: _Declared = read(content)
-    except _WrongField as error:
-        raise ControlError(str(error)) from None
+    found, start = [], 0
+    with memoryview(received) as view:
+        while len(view) >= start + _LENGTH_BYTES:
+            begin = start + _LENGTH_BYTES
+            end = begin + int.from_bytes(view[start:begin], "little")
+            if end - begin > _LONGEST_BYTES:
+                shown = _shown(bytes(view[start : start + _LONGEST_SHOWN]))
+                raise ControlError(f"{peer} sent something that is not a control message: {shown}")
+            if end > len(view):
+                break
+            found.append(bytes(view[begin:end]))
+            start = end
+    del received[:start]
     return found
-
-
-class _WrongField(Exception):
-    """A field that does not fit its class; the path to it grows from the inside."""
-
-    def __init__(self, problem: str, path: str = "") -> None:
-        self.problem = problem
-        self.path = path
-
-    def inside(self, step: str) -> _WrongField:
-        """The error, seen from what holds it."""
-        self.path = step + self.path
-        return self
-
-    def __str__(self) -> str:
-        return f"field {self.path.lstrip('.')} {self.problem}"
-
-
-def _plain(value: Any) -> Any:
-    return value.value if isinstance(value, Enum) else vars(value)
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."
-
-
-_Reader = Callable[[Any], Any]
-"""Makes a value of its declared type from JSON. Raises :class:`_WrongField`."""
 
 
 @functools.cache
-def _reader(declared: Any) -> _Reader:
-    """The reader of a declared type."""
-    origin, arguments = get_origin(declared), get_args(declared)
-    if declared is Any:
-        return lambda value: value
-    if origin in (Union, types.UnionType):
-        (some,) = (each for each in arguments if each is not types.NoneType)
-        read_some = _reader(some)
-        return lambda value: None if value is None else read_some(value)
-    if origin is tuple:
-        if arguments[-1] is Ellipsis:
-            return functools.partial(_read_list, _reader(arguments[0]))
-        return functools.partial(_read_tuple, tuple(map(_reader, arguments)))
-    if is_typeddict(declared):
-        return _read_object
-    if origin is Mapping or origin is dict:
-        return functools.partial(_read_mapping, _reader(arguments[1]))
-    if is_dataclass(declared):
-        return _dataclass_reader(declared)
-    if issubclass(declared, Enum):
-        return functools.partial(_read_enum, declared)
-    return functools.partial(_read_scalar, declared)
+def decoder_of(accepted: tuple[type[Message], ...]) -> msgspec.msgpack.Decoder[Message]:
+    """Decodes these messages, and no others."""
+    return msgspec.msgpack.Decoder(Union[accepted])  # noqa: UP007
 
 
-def _read_scalar(kind: type, value: Any) -> Any:
-    """A value of this type; ``bool`` is no number, and an ``int`` may stand for a ``float``."""
-    if type(value) is kind or (kind is float and type(value) is int):
-        return value
-    raise _must_be(kind.__name__, value)
+def decode(data: bytes, decoder: msgspec.msgpack.Decoder[Message], peer: str) -> Message:
+    """The message of these bytes, which are without their length; ``peer`` has sent it.
 
-
-def _read_object(value: Any) -> dict[str, Any]:
-    if type(value) is dict:
-        return value
-    raise _must_be("an object", value)
-
-
-def _read_list(read: _Reader, value: Any) -> tuple[Any, ...]:
-    if type(value) is not list:
-        raise _must_be("a list", value)
-    return _read_tuple([read] * len(value), value)
-
-
-def _read_tuple(readers: Sequence[_Reader], value: Any) -> tuple[Any, ...]:
-    if type(value) is not list or len(value) != len(readers):
-        raise _must_be(f"a list of {len(readers)}", value)
-    found: list[Any] = []
+    Raises:
+        ControlError: if it is none that may come, or a field is missing, unknown or of a wrong
+            type.
+    """
     try:
-        for read, each in zip(readers, value, strict=True):
-            found.append(read(each))
-    except _WrongField as error:
-        raise error.inside(f"[{len(found)}]") from None
-    return tuple(found)
+        return decoder.decode(data)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise ControlError(
+            f"{peer} sent a wrong control message: {error}: {_shown(data)}"
+        ) from None
 
 
-def _read_mapping(read: _Reader, value: Any) -> dict[str, Any]:
-    found = {}
-    for key, each in _read_object(value).items():
-        try:
-            found[key] = read(each)
-        except _WrongField as error:
-            raise error.inside(f"[{key!r}]") from None
-    return found
+def read_as(declared: type[_Declared], content: Any) -> _Declared:
+    """An object of a class from JSON that somebody else has written.
 
-
-def _read_enum(kind: type[Enum], value: Any) -> Enum:
+    Raises:
+        ControlError: if a field is missing or of a wrong type.
+    """
     try:
-        return kind(value)
-    except ValueError:
-        raise _must_be(f"one of {', '.join(str(each.value) for each in kind)}", value) from None
+        return msgspec.convert(content, declared)
+    except msgspec.ValidationError as error:
+        raise ControlError(str(error)) from None
 
 
-def _dataclass_reader(declared: Any) -> _Reader:
-    """Reads a dataclass; fields with a default may be missing."""
-    hints = get_type_hints(declared)
-    readers = {each.name: _reader(hints[each.name]) for each in fields(declared)}
-    required = {
-        each.name
-        for each in fields(declared)
-        if each.default is MISSING and each.default_factory is MISSING
-    }
-
-    def read(value: Any) -> Any:
-        given = _read_object(value)
-        if missing := required - given.keys():
-            raise _WrongField("is missing", f".{min(missing)}")
-        if unknown := given.keys() - readers.keys():
-            raise _WrongField("is unknown", f".{min(unknown)}")
-        found = {}
-        for name, each in given.items():
-            try:
-                found[name] = readers[name](each)
-            except _WrongField as error:
-                raise error.inside(f".{name}") from None
-        return declared(**found)
-
-    return read
+def _missing_bytes(received: bytearray) -> int:
+    """How much has to come for the first message to be whole."""
+    return int.from_bytes(received[:_LENGTH_BYTES], "little") + _LENGTH_BYTES - len(received)
 
 
-def _must_be(expected: str, value: Any) -> _WrongField:
-    return _WrongField(f"is {_shown(value)}, and must be {expected}")
+def _shown(data: bytes) -> str:
+    text = repr(data)
+    return text if len(text) <= _LONGEST_SHOWN else f"{text[:_LONGEST_SHOWN]}..."

@@ -162,22 +162,25 @@ class Channels:
             if link not in self._links:
                 return
             try:
-                lines = link.read_lines()
+                found = link.read()
             except BlockingIOError:
                 return
-            for line in lines or ():
-                yield link, self._message_in(line, link)
-            if lines is None:
+            except ControlError as error:
+                yield link, error
+                return
+            for data in found or ():
+                yield link, self._message_in(data, link)
+            if found is None:
                 if link in self._nodes:
                     self.parted[self._nodes[link]] = time.monotonic()
                 self.hang_up(link)
             if link not in self._nodes:
                 return
 
-    def _message_in(self, line: bytes, link: ControlLink) -> Message | ControlError:
+    def _message_in(self, data: bytes, link: ControlLink) -> Message | ControlError:
         """The message, after which it is known who is at the other end; else why there is none."""
         try:
-            message = link.decode(line)
+            message = link.decode(data)
         except ControlError as error:
             return error
         if isinstance(message, control.Hello):

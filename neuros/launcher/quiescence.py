@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
@@ -300,8 +299,7 @@ def _reliable(
             yield (connection, sender.metrics["outgoing"][key], receiver.metrics["incoming"][key])
 
 
-@dataclass(frozen=True)
-class DeclaredHook(HookDeclaration):
+class DeclaredHook(HookDeclaration, frozen=True):
     """A hook as its plugin declares it; ``place`` is that among the hooks of its node's engine."""
 
     node: str = ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -317,13 +316,13 @@ class NodeRuntime:
             raise ControlError(f"a packet came for '{self.name}.{input_name}', no session's input")
         self.on_external_packet(port, self._middleware.packets.decode(port.type, data))
 
-    def deliver_if_right(self, input_name: str, data: str) -> None:
-        """An observer sends a packet to an input of the session, in base64.
+    def deliver_if_right(self, input_name: str, data: bytes) -> None:
+        """An observer sends a packet to an input of the session.
 
         What is none is refused in the log: an observer ends no run by a mistake.
         """
         try:
-            self.deliver(input_name, base64.b64decode(data))
+            self.deliver(input_name, data)
         except (ControlError, ProtocolError, ValueError) as error:
             self._enter()  # the log is that of its own
             self._logger.warning(f"a packet for input '{input_name}' is refused: {error}")

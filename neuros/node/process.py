@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import functools
 import gc
@@ -584,7 +583,7 @@ def _at_rest(nodes: Sequence[NodeRuntime], asked: control.Settle) -> control.AtR
     windows = [w for engine in engines for w in engine.send_windows.values()]
     subscriptions = [s for engine in engines for s in engine.subscriptions.values()]
     packets = {
-        f"{node.name}.{output}": control.NewestPacket(number, base64.b64encode(data).decode())
+        f"{node.name}.{output}": control.NewestPacket(number, data)
         for node in nodes
         for output, (number, data) in node.newest.by_output.items()
         if number > asked.known.get(f"{node.name}.{output}", number)

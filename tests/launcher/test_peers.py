@@ -274,7 +274,6 @@ def test_a_state_comes_through_as_it_was() -> None:
         '{"run": "r"}',
         '{"run": "r", "machine": "m", "number": "1"}',
         '{"run": "r", "machine": "m", "counters": []}',
-        '{"run": "r", "machine": "m", "colour": "red"}',
         "[" * 100_000,
     ],
 )

@@ -10,6 +10,7 @@ from typing import Any, cast
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec import structs
 
 from neuros.control import Report
 from neuros.launcher.stall_detector import Backlog, StallDetector
@@ -208,7 +209,7 @@ def test_nodes_that_start_slowly_are_named() -> None:
     detector.greet(["b", "c"], {}, 0.0)
     detector.report(LOADING, 4.0)
     detector.note_loaded("c")  # and waits for the others in its process
-    detector.report(replace(LOADING, node="c"), 4.0)
+    detector.report(structs.replace(LOADING, node="c"), 4.0)
     assert remarks(detector, 5.0) == ["still starting: a", "still importing their plugins: b"]
 
 
@@ -383,11 +384,11 @@ def test_a_process_tells_only_of_plugins_of_its_own() -> None:
 def test_where_a_node_stands_is_what_was_read_else_what_it_told() -> None:
     reader = reader_of(HELD, ProcessThreads(problem="nobody may"))
     detector = of_plugins(reader, {"a": "/a.py"})
-    detector.report(replace(report("a"), stack=Stack("a", "before", "told")), 0.0)
+    detector.report(structs.replace(report("a"), stack=Stack("a", "before", "told")), 0.0)
     reader.begin("a")
     assert detector.where(["a"], 3.0) == ({"a": STACK}, HELD)
     assert detector.where(["a"], 1.0) == ({"a": "told"}, HELD), "that is new, and has source lines"
-    detector.report(replace(report("a"), stack=Stack("a", "after", "told again")), 1.0)
+    detector.report(structs.replace(report("a"), stack=Stack("a", "after", "told again")), 1.0)
     reader.begin("a")
     texts, read = detector.where(["a"], 9.0)
     assert (texts, read.problem) == ({"a": "told again"}, "nobody may")

@@ -24,12 +24,13 @@ from neuros.control import (
     Look,
     LookAll,
     Probe,
+    Ready,
     Settled,
     Stop,
     WasReset,
     Watch,
 )
-from neuros.control.link import ControlLink, kind_of
+from neuros.control.link import ControlLink, encode
 from neuros.errors import ControlError
 from neuros.launcher.channels import Channels
 
@@ -60,7 +61,7 @@ def node(channels: Channels, tmp_path: Path) -> Iterator[Node]:
 
 def kinds(channels: Channels) -> list[Any]:
     return [
-        "refused" if isinstance(message, ControlError) else kind_of(type(message))
+        "refused" if isinstance(message, ControlError) else type(message).__struct_config__.tag
         for _, message in channels.receive()
     ]
 
@@ -93,24 +94,23 @@ def test_several_hundred_kilobytes_are_one_go_too(channels: Channels, node: Node
     assert kinds(channels)[1 : count + 1] == ["explanation"] * count
 
 
-def test_half_a_line_waits_for_its_other_half(channels: Channels, node: Node) -> None:
-    node.socket.sendall(b'{"kind": "wat')
+def test_half_a_message_waits_for_its_other_half(channels: Channels, node: Node) -> None:
+    data = encode(Watch())
+    node.socket.sendall(data[:7])
     assert kinds(channels) == []
-    node.socket.sendall(b'ch"}\n')
+    node.socket.sendall(data[7:])
     assert kinds(channels) == ["watch"]
 
 
 def test_what_is_not_understood_comes_as_an_error_that_names_its_sender(
     channels: Channels, node: Node
 ) -> None:
-    node.socket.sendall(b"GET / HTTP/1.1\r\n")
+    node.send(Ready("a"))
     node.send(Hello(("a", "b")))
-    node.socket.sendall(b'{"kind": "ready"}\n')
+    node.send(Watch())
     (link, stranger), _, (_, known) = channels.receive()
-    assert str(stranger).startswith("an unknown program sent something that is not a control")
-    assert str(known) == (
-        "the process of a and b sent a wrong control message 'ready': field node is missing"
-    )
+    assert str(stranger).startswith("an unknown program sent a wrong control message: Invalid")
+    assert str(known).startswith("the process of a and b sent a wrong control message: Invalid")
     channels.hang_up(link)
     node.socket.settimeout(5.0)
     assert node.receive() is None
@@ -201,7 +201,7 @@ def test_only_hello_and_watch_are_greetings_and_each_says_what_may_follow(
         each.send(Failed("a", "why"))
         heard = [kind for _ in range(2) for kind in kinds(channels)]
         allowed = ["refused", "failed"] if each is node else ["end", "refused"]
-        assert heard == ["refused", "refused", kind_of(type(greeting)), *allowed]
+        assert heard == ["refused", "refused", type(greeting).__struct_config__.tag, *allowed]
     observer.close()
 
 
@@ -223,7 +223,7 @@ def test_what_a_session_sends_reaches_a_node_to_which_much_is_to_be_sent(
 ) -> None:
     node.send(Hello(("a",)))
     assert kinds(channels) == ["hello"]
-    packets = [Deliver("a", "image", letter * 2_000_000) for letter in "xyz"]
+    packets = [Deliver("a", "image", bytes([number]) * 2_000_000) for number in range(3)]
     for packet in packets:
         channels.send_to_node("a", packet)
     assert received(channels, node, until=packets[-1]) == packets

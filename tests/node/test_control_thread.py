@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from neuros.control import TO_NODES, Message, Pause, Probe
+from neuros.control import TO_NODES, Message, Pause, Probe, Ready
 from neuros.control.link import ControlLink, encode
 from neuros.errors import ControlError
 from neuros.node.process import ControlThread
@@ -55,7 +55,7 @@ def test_messages_are_obeyed_in_their_order_until_the_supervisor_hangs_up() -> N
 
 
 def test_what_is_not_understood_fails_in_the_loop() -> None:
-    process = run(b'{"kind": "dance"}\n')
+    process = run(encode(Ready("a")))
     (fail,) = process.events
-    with pytest.raises(ControlError, match="the supervisor sent a control message of the unknown"):
+    with pytest.raises(ControlError, match="the supervisor sent a wrong control message: I"):
         fail()

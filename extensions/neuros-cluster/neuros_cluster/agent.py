@@ -18,7 +18,6 @@ import sys
 import tempfile
 import threading
 import time
-from base64 import b64decode
 from collections.abc import Iterable, Mapping
 from importlib.util import find_spec
 from pathlib import Path
@@ -196,7 +195,7 @@ class Agent:
             self._place()
 
     def _receive(self, content: Content) -> None:
-        self._store.receive(content.digest, b64decode(content.data))
+        self._store.receive(content.digest, content.data)
         if content.is_last:
             self._awaited.discard(content.digest)
             if not self._awaited:

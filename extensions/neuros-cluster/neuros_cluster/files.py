@@ -27,10 +27,10 @@ import json
 import os
 import shutil
 import time
-from base64 import b64decode, b64encode
 from collections.abc import Collection, Iterator, Mapping, Sequence, Set
-from dataclasses import asdict
 from pathlib import Path
+
+from msgspec.structs import asdict
 
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.errors import EnvironmentFault
@@ -255,12 +255,12 @@ class Follower:
             sent = self._sent.get(name, 0)
             if name not in self._sent or size < sent:
                 self._sent[name] = sent = min(sent, size)
-                yield Chunk(name, sent, "")
+                yield Chunk(name, sent, b"")
             file.seek(sent)
             while data := file.read(_CHUNK_BYTES):
                 offset = self._sent[name]
                 self._sent[name] += len(data)  # who takes it may not ask for more
-                yield Chunk(name, offset, b64encode(data).decode())
+                yield Chunk(name, offset, data)
 
 
 def write_chunk(run: Path, chunk: Chunk) -> int:
@@ -270,14 +270,13 @@ def write_chunk(run: Path, chunk: Chunk) -> int:
         raise OSError(f"{chunk.path} is outside of the run folder")
     folders = path.relative_to(run).parent.parts
     try:
-        data = b64decode(chunk.data)
         run.mkdir(parents=True, exist_ok=True)
         with (
             folder_in(run, *folders, makes=True) as folder,
             open_log(folder / path.name) as file,
         ):
             file.truncate(chunk.offset)  # what is written goes to the end
-            file.write(data)
-    except (ValueError, OverflowError) as error:  # neither a path nor base64 nor an offset
+            file.write(chunk.data)
+    except (ValueError, OverflowError) as error:  # neither a path nor an offset
         raise OSError(str(error)) from error
-    return len(data)
+    return len(chunk.data)

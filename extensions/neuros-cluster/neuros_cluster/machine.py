@@ -13,16 +13,17 @@ import shlex
 import subprocess
 import threading
 import time
-from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
+from msgspec import structs
+
 import neuros_cluster.messages as agent
 from neuros.backends.node_command import without_mark
-from neuros.control import FROM_NODES, Message, NodeStatus, Probed, Report
-from neuros.control.link import decode, encode, kind_of
+from neuros.control import FROM_NODES, Message, NodeStatus, Report
+from neuros.control.link import decode, decoder_of, to_bytes
 from neuros.distribution import WORKSPACE, __version__
 from neuros.errors import ControlError, EnvironmentFault
 from neuros.ordinary_files import reason_of, write_whole
@@ -102,7 +103,7 @@ class Machine:
             self._take,
             self._lose,
             connect=self._connect,
-            translate=self.clock.text_here,
+            translate=self.clock.data_here,
         )
         # The pump alone has them, so that the agent sees the end when it closes them.
         self._process.stdin.close()
@@ -331,8 +332,7 @@ class Machine:
                         self._require_open()  # else, after Ctrl+C, nobody writes it any more
                         time.sleep(_LOOK_S)
                     self._require_open()
-                    text = b64encode(data).decode()
-                    self._pump.send(agent.Content(digest, text, not following))
+                    self._pump.send(agent.Content(digest, data, not following))
                     if not following:
                         return
                     data = following
@@ -380,8 +380,6 @@ class _LastWords(threading.Thread):
 _MOST_DRIFT = 1e-4
 """Seconds per second by which clocks drift apart: crystals are within 1e-4 of what they show."""
 
-_ACCEPTED = {kind_of(each): each for each in FROM_NODES}
-_WITH_TIMES = tuple(f'{{"kind": "{kind_of(each)}"' for each in (Report, Probed, NodeStatus))
 # Columns of times in the files of a packet log, of so many columns each.
 _TIMES: Mapping[str, tuple[int, tuple[int, ...]]] = {
     "sent_ns": (1, (0,)),
@@ -437,32 +435,25 @@ class ClockOffset:
         """Whether there was an answer."""
         return self.round_trip_s < float("inf")
 
-    def text_here(self, text: str) -> str:
-        """Lines of nodes there, with their times on the clock of this machine."""
-        return "".join(
-            self._line_here(line) for line in text.splitlines(keepends=True) if line.strip()
-        )
-
-    def _line_here(self, line: str) -> str:
-        if not line.startswith(_WITH_TIMES):
-            return line
+    def data_here(self, data: bytes) -> bytes:
+        """The bytes of a message of a node there, with its times on the clock of this machine."""
         try:
-            return encode(self.message_here(decode(line.encode(), _ACCEPTED, ""))).decode()
+            return to_bytes(self.message_here(decode(data, decoder_of(tuple(FROM_NODES)), "")))
         except ControlError:  # the supervisor says what is wrong with it
-            return line
+            return data
 
     def message_here(self, message: Message) -> Message:
         """A message of a node there, with its times on the clock of this machine."""
         shift_s, shift_ns = self.monotonic_s, round(1e9 * self.monotonic_s)
         if isinstance(message, Report):
             since_s = message.running_since_s
-            return replace(
+            return structs.replace(
                 message,
                 running_since_s=None if since_s is None else since_s - shift_s,
                 timeline=tuple((sim_s, wall_s - shift_s) for sim_s, wall_s in message.timeline),
             )
         if isinstance(message, NodeStatus):
-            counters = message.counters and replace(
+            counters = message.counters and structs.replace(
                 message.counters,
                 now_s=message.counters.now_s - shift_s,
                 sent_ns={
@@ -481,7 +472,7 @@ class ClockOffset:
                 else each
                 for port, each in message.samples.items()
             }
-            return replace(message, counters=counters, samples=samples)
+            return structs.replace(message, counters=counters, samples=samples)
         return message
 
     def log_here(self, folder: Path) -> None:

@@ -1,15 +1,16 @@
 """Messages between a launcher and its agents: the programs that run its nodes on other machines.
 
-They travel as lines of JSON, as those of the control channel do, over the standard input and output
-of the program that reaches the machine (``ssh``). Control connections of the nodes there pass
-through: each has a number, and its lines are the text of :class:`Said`.
+They travel as those of the control channel do, over the standard input and output of the program
+that reaches the machine (``ssh``). Control connections of the nodes there pass through: each has a
+number, and each of its messages is the data of a :class:`Said`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
+
+import msgspec
 
 from neuros.control import Message
 from neuros.stacks import ProcessThreads
@@ -17,14 +18,12 @@ from neuros.stacks import ProcessThreads
 # ---------------------------------------------------------------------- both ways
 
 
-@dataclass(frozen=True)
 class Ping(Message):
     """A sign of life, to be answered at once; ``sent_s`` is on the sender's monotonic clock."""
 
     sent_s: float
 
 
-@dataclass(frozen=True)
 class Pong(Message):
     """The answer, with the clocks of who answers: monotonic, and Unix time, in seconds."""
 
@@ -33,22 +32,19 @@ class Pong(Message):
     unix_s: float
 
 
-@dataclass(frozen=True)
 class Opened(Message):
     """A control connection has been made to the agent."""
 
     link: int
 
 
-@dataclass(frozen=True)
 class Said(Message):
-    """Whole lines on a control connection."""
+    """A message on a control connection, without its length."""
 
     link: int
-    text: str
+    data: bytes
 
 
-@dataclass(frozen=True)
 class Closed(Message):
     """A control connection has ended."""
 
@@ -58,8 +54,7 @@ class Closed(Message):
 # ---------------------------------------------------------------------- from the launcher
 
 
-@dataclass(frozen=True)
-class TreeFile:
+class TreeFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A file of a tree: its path in there, the SHA-256 of its content, its length."""
 
     path: str
@@ -68,15 +63,13 @@ class TreeFile:
     is_executable: bool = False
 
 
-@dataclass(frozen=True)
-class Tree:
+class Tree(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A folder with files, known by its content."""
 
     name: str
     files: tuple[TreeFile, ...]
 
 
-@dataclass(frozen=True)
 class Place(Message):
     """Have these folders there; the last sign of life may be ``timeout_s`` seconds old."""
 
@@ -85,23 +78,20 @@ class Place(Message):
     timeout_s: float
 
 
-@dataclass(frozen=True)
 class Content(Message):
-    """The next part of a file that is lacking, in base64."""
+    """The next part of a file that is lacking."""
 
     digest: str
-    data: str
+    data: bytes
     is_last: bool
 
 
-@dataclass(frozen=True)
 class Prepare(Message):
     """Get ready for nodes: their ``node.json``, with the paths of the agent's machine."""
 
     nodes: tuple[Mapping[str, Any], ...]
 
 
-@dataclass(frozen=True)
 class Start(Message):
     """Start the nodes that were prepared.
 
@@ -127,33 +117,28 @@ class Start(Message):
     monitors_load: bool = False
 
 
-@dataclass(frozen=True)
 class KillNode(Message):
     """Kill the process of a node."""
 
     node: str
 
 
-@dataclass(frozen=True)
 class ReadThreads(Message):
     """Read where the threads of a node's process stand."""
 
     node: str
 
 
-@dataclass(frozen=True)
 class Took(Message):
     """So many bytes of :class:`Chunk` have been written."""
 
     size: int
 
 
-@dataclass(frozen=True)
 class Examine(Message):
     """Look at the machine, as ``neuros doctor`` does."""
 
 
-@dataclass(frozen=True)
 class Finish(Message):
     """All nodes have ended: send what they have left, remove it, and end."""
 
@@ -161,7 +146,6 @@ class Finish(Message):
 # ---------------------------------------------------------------------- from the agent
 
 
-@dataclass(frozen=True)
 class Ready(Message):
     """The agent is up.
 
@@ -178,14 +162,12 @@ class Ready(Message):
     reached_at: str = ""
 
 
-@dataclass(frozen=True)
 class Lacking(Message):
     """The content that has to be sent, by digest; perhaps none."""
 
     digests: tuple[str, ...]
 
 
-@dataclass(frozen=True)
 class Placed(Message):
     """The folders are there."""
 
@@ -194,7 +176,6 @@ class Placed(Message):
     run: str
 
 
-@dataclass(frozen=True)
 class Remark(Message):
     """A line for the user."""
 
@@ -202,26 +183,22 @@ class Remark(Message):
     text: str
 
 
-@dataclass(frozen=True)
 class Prepared(Message):
     """Nodes can be started; ``messages`` are the folders of built message packages."""
 
     messages: tuple[str, ...]
 
 
-@dataclass(frozen=True)
 class Started(Message):
     """The processes of all nodes have been started."""
 
 
-@dataclass(frozen=True)
 class Refused(Message):
     """What was asked for last cannot be done, in sentences for the user."""
 
     text: str
 
 
-@dataclass(frozen=True)
 class NodeEnded(Message):
     """The process of a node has ended, in words; its log has been sent."""
 
@@ -229,7 +206,6 @@ class NodeEnded(Message):
     how: str
 
 
-@dataclass(frozen=True)
 class ThreadsRead(Message):
     """Where the threads of a node's process stand."""
 
@@ -237,28 +213,25 @@ class ThreadsRead(Message):
     read: ProcessThreads
 
 
-@dataclass(frozen=True)
 class Chunk(Message):
-    """Bytes of a file of the run folder, in base64, at the offset at which it is to end before."""
+    """Bytes of a file of the run folder, at the offset at which it is to end before."""
 
     path: str
     offset: int
-    data: str
+    data: bytes
 
 
-@dataclass(frozen=True)
 class Examined(Message):
     """What was found: state, subject, text and remedy of each finding."""
 
     findings: tuple[tuple[str, str, str, str], ...]
 
 
-@dataclass(frozen=True)
 class Finished(Message):
     """All has been sent; ``load``: the summary of the system load there, ``None`` without one."""
 
     load: Mapping[str, Any] | None = None
-    problems: tuple[str, ...] = field(default=())
+    problems: tuple[str, ...] = ()
 
 
 BOTH_WAYS: Sequence[type[Message]] = (Ping, Pong, Opened, Said, Closed)

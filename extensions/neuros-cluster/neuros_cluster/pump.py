@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from neuros.control import Message
-from neuros.control.link import ControlLink, decode, encode, kind_of
+from neuros.control.link import ControlLink, decode, decoder_of, encode, framed, remove_messages
 from neuros.errors import ControlError
 from neuros.ports import ControlListener, ControlStream
 from neuros_cluster.messages import Closed, Opened, Ping, Pong, Said
@@ -55,18 +55,18 @@ class Pump(threading.Thread):
         lose: Callable[[str], None],
         *,
         connect: Callable[[], ControlStream] | None = None,
-        translate: Callable[[str], str] = str,
+        translate: Callable[[bytes], bytes] = bytes,
     ) -> None:
         super().__init__(name=f"neuros-{peer}", daemon=True)
         self.timeout_s: float | None = None
         self.heard_s = time.monotonic()
         self._read_from, self._write_to = read_from, write_to
-        self._accepted = {kind_of(each): each for each in accepted}
+        self._decoder = decoder_of(tuple(accepted))
         self._peer, self._take, self._lose = peer, take, lose
         self._connect, self._translate = connect, translate
         self._lock = threading.Lock()
         self._unsent = bytearray()
-        self._rest = b""
+        self._received = bytearray()
         self._last: deque[Message] = deque()
         self._links: dict[int, ControlLink] = {}
         self._count = 0
@@ -185,10 +185,10 @@ class Pump(threading.Thread):
         if not data:
             return _CLOSED
         self.heard_s = time.monotonic()
-        *lines, self._rest = (self._rest + data).split(b"\n")
+        self._received += data
         try:
-            for line in lines:
-                self._obey(decode(line, self._accepted, self._peer))
+            for each in remove_messages(self._received, self._peer):
+                self._obey(decode(each, self._decoder, self._peer))
         except ControlError as error:
             return str(error)
         return ""
@@ -200,9 +200,9 @@ class Pump(threading.Thread):
             case Opened(number):
                 if self._connect is not None:
                     self._open(number)
-            case Said(number, text):
+            case Said(number, data):
                 if number in self._links:
-                    self._links[number].unsent += self._translate(text).encode()
+                    self._links[number].unsent += framed(self._translate(data))
             case Closed(number):
                 self._hang_up(number)
             case _:
@@ -252,21 +252,22 @@ class Pump(threading.Thread):
 
     def _add(self, number: int, stream: ControlStream) -> None:
         stream.setblocking(False)
-        self._links[number] = link = ControlLink(stream, (), self._peer)
+        self._links[number] = link = ControlLink(stream, (Message,), self._peer)
         self._selector.register(link, selectors.EVENT_READ)
 
     def _relay(self, number: int, link: ControlLink) -> bool:
         """Pass on what was said; returns whether there may be more right now."""
         try:
-            lines = link.read_lines()
+            found = link.read()
         except BlockingIOError:
             return False
-        if lines is None:
+        except ControlError:
+            found = None
+        if found is None:
             self._part(number)
             return False
-        if lines:
-            text = b"".join(line + b"\n" for line in lines)
-            self.send(Said(number, text.decode("utf-8", "replace")))
+        for data in found:
+            self.send(Said(number, data))
         return True
 
     def _part(self, number: int) -> None:

@@ -35,12 +35,13 @@ SLOW_NETWORK = """
 import os, subprocess, sys, time
 held, goes_on, *command = sys.argv[1:]
 agent = subprocess.Popen(command, stdout=subprocess.PIPE)
-for line in iter(agent.stdout.readline, b""):
-    if b'"loaded' in line:
+for length in iter(lambda: agent.stdout.read(4), b""):
+    message = length + agent.stdout.read(int.from_bytes(length, "little"))
+    if b"kind\\xa6loaded" in message:
         open(held, "w").close()
         while not os.path.exists(goes_on):
             time.sleep(0.01)
-    os.write(1, line)
+    os.write(1, message)
 sys.exit(agent.wait())
 """
 BEGINS = """
@@ -172,11 +173,18 @@ def test_a_dry_run_says_what_would_run_where_and_reaches_nobody(
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
-def test_where_a_node_stands_is_asked_of_its_machine_unless_that_is_gone() -> None:
+ANSWERS = """
+import os, sys
+while data := os.read(0, 1 << 16):
+    if b"read_threads" in data:
+        os.write(1, open(sys.argv[1], "rb").read())
+"""
+
+
+def test_where_a_node_stands_is_asked_of_its_machine_unless_that_is_gone(tmp_path: Path) -> None:
     read = ProcessThreads(problem="nobody may")
-    answers = 'while read -r line; do case $line in *read_threads*) echo "$0";; esac; done'
-    answer = encode(ThreadsRead("eye", read)).decode().strip()
-    host = Host("robot", through=("sh", "-c", answers, answer))
+    (tmp_path / "answer").write_bytes(encode(ThreadsRead("eye", read)))
+    host = Host("robot", through=(sys.executable, "-c", ANSWERS, str(tmp_path / "answer")))
     machine = Machine(host, ENDED_S, lambda severity, text: None, agent_command(host))
     try:
         assert machine.threads_of("eye") == machine.threads_of("eye") == read
@@ -193,9 +201,10 @@ def test_ctrl_c_ends_the_sending_of_a_project(tmp_path: Path) -> None:
     project.mkdir()
     (project / "weights").write_bytes(bytes(1 << 22))
     (file,) = scan("project", project).files
-    agent = 'echo "$0"; head -c 100000 >/dev/null; touch "$1"; exec sleep 600'
-    answer = encode(Lacking((file.digest,))).decode().strip()
-    host = Host("robot", through=("sh", "-c", agent, answer, str(takes_no_more)))
+    agent = 'cat "$0"; head -c 100000 >/dev/null; touch "$1"; exec sleep 600'
+    (tmp_path / "answer").write_bytes(encode(Lacking((file.digest,))))
+    through = ("sh", "-c", agent, str(tmp_path / "answer"), str(takes_no_more))
+    host = Host("robot", through=through)
     machine = Machine(host, ENDED_S, lambda severity, text: None, agent_command(host))
     closer = threading.Thread(target=machine.close)  # what Ctrl+C does
     with ThreadPoolExecutor(1) as threads:

@@ -401,7 +401,7 @@ class LiveRun:
                 if self._answered >= self._names:
                     self._has_answered.set()
             case PhaseChanged():
-                self.phase = dict(vars(message))
+                self.phase = {"phase": message.phase, "is_paused": message.is_paused}
                 self._pages.send("phase", self.phase)
             case LogRecord(severity, text):
                 self._pages.send("log", [f"[{severity}] [neuros] {text}"])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 from neuros_dashboard.live_metrics import LiveMetrics
 
 from neuros.control import LiveCounters, NodeStatus, Report
