@@ -5,9 +5,8 @@ from __future__ import annotations
 import collections.abc
 import re
 import socket
-import struct
 from collections.abc import Mapping
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args, get_origin
@@ -23,8 +22,10 @@ from neuros import control
 from neuros.control import (
     FROM_NODES,
     FROM_OBSERVERS,
+    FROM_SESSION,
     TO_NODES,
     TO_OBSERVERS,
+    Advance,
     Ended,
     Finalising,
     HookDeclaration,
@@ -35,16 +36,24 @@ from neuros.control import (
     NodeStatus,
     Probed,
     Report,
+    Settled,
 )
-from neuros.control import steps as step_module
-from neuros.control.link import ControlLink, decode, decoder_of, encode, remove_messages, to_bytes
-from neuros.control.steps import Advance, Advanced, Arrivals, StepLink
+from neuros.control import link as link_module
+from neuros.control.link import (
+    Arrivals,
+    ControlLink,
+    decode,
+    decoder_of,
+    encode,
+    remove_messages,
+    to_bytes,
+)
 from neuros.errors import ControlError
 from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "control_channel.md"
-MESSAGES = dict.fromkeys([*FROM_NODES, *TO_NODES, *FROM_OBSERVERS, *TO_OBSERVERS])
+MESSAGES = dict.fromkeys([*FROM_NODES, *TO_NODES, *FROM_OBSERVERS, *TO_OBSERVERS, *FROM_SESSION])
 DECODER = decoder_of(tuple(MESSAGES))
 METRICS: Any = {"state": {"state": "idle", "cause": ""}, "executing": None, "hooks": {}}
 METRICS |= {"outgoing": {}, "incoming": {}, "accounting": {}}
@@ -73,6 +82,8 @@ RICH = [
     NodeStatus("a", 1, 2.0, LiveCounters(1.0, METRICS, {"c": (2, (7, 8))}, {"c": (1, 9)}), {}),
     Ended(0, "why", {"a": REPORT}, 2.0, 0.5, True),
     Finalising("a", None),
+    Advance(7, 2, {"a.o": 3}, (("a", "x", b"abcd"), ("a", "y", b""))),
+    Settled(7, {"a": 0.25}, {"a.o": (4, bytes(200_000)), "a.p": (1, b"")}),
 ]
 
 
@@ -102,14 +113,15 @@ class Pieces:
         return self._pieces.pop(0)
 
 
-def test_messages_come_out_wherever_the_stream_was_cut() -> None:
-    stop, long = encode(control.Stop()), encode(control.Say("x" * 10_000))
-    data = stop + long + stop + long
-    for size in (1, 7, 4096, len(stop), len(data)):
-        pieces = [data[begin : begin + size] for begin in range(0, len(data), size)]
-        link = ControlLink(Pieces(*pieces), control.TO_NODES, "it")  # type: ignore[arg-type]
-        found = [message for _ in pieces for message in link.receive() or ()]
-        assert found == [control.Stop(), control.Say("x" * 10_000)] * 2
+@given(st.lists(st.sampled_from(RICH), max_size=4), st.data())
+def test_messages_come_out_wherever_the_stream_was_cut(
+    sent: list[Message], data: st.DataObject
+) -> None:
+    stream = b"".join(map(encode, sent))
+    cuts = sorted({*data.draw(st.sets(st.integers(1, len(stream)))), len(stream)}) if stream else []
+    pieces = [stream[start:end] for start, end in pairwise([0, *cuts])]
+    link = ControlLink(Pieces(*pieces), [*MESSAGES], "it")  # type: ignore[arg-type]
+    assert [message for _ in pieces for message in link.receive() or ()] == sent
 
 
 def test_half_a_character_arrives_as_its_escape() -> None:
@@ -203,65 +215,13 @@ def table(kinds: Any) -> str:
         ("To node processes", TO_NODES),
         ("From an observer", FROM_OBSERVERS),
         ("To observers", TO_OBSERVERS),
+        ("From a session to its nodes", FROM_SESSION),
     ],
 )
 def test_the_page_shows_the_messages_as_they_are(title: str, kinds: Any) -> None:
     text = PAGE.read_text("utf-8")
     section = re.split(rf"^### {title}$", text, flags=re.MULTILINE)[1]
     assert section.split("\n### ")[0].split("\n## ")[0].strip() == table(kinds)
-
-
-STEPS = [
-    Advance(1, 1, {}, []),
-    Advance(7, 2, {"robot.imu": 3}, [("robot", "wheels", b"abcd"), ("robot", "arm", b"")]),
-    Advanced(7, {"robot": 0.25}, {"robot.imu": (4, b"12345678"), "robot.eye": (1, bytes(200_000))}),
-    Advanced(8, {}, {}),
-]
-
-
-def read_in_pieces(data: bytes, kind: Any, sizes: list[int]) -> list[Any]:
-    """The messages in these bytes, of which reads bring so many each."""
-    pieces = [data[end - size : end] for size, end in zip(sizes, accumulate(sizes), strict=True)]
-    stream: Any = SimpleNamespace(recv=lambda _: pieces.pop(0))
-    link: StepLink[Any] = StepLink(stream, kind, "the session")
-    return [message for _ in sizes for message in link.receive() or ()]
-
-
-@given(st.lists(st.sampled_from(STEPS), max_size=4), st.data())
-def test_a_step_comes_out_as_it_went_in_however_its_bytes_arrive(
-    steps: list[Any], data: st.DataObject
-) -> None:
-    for kind in (Advance, Advanced):
-        sent = [each for each in steps if type(each) is kind]
-        stream = b"".join(each.to_frame() for each in sent)
-        cuts = data.draw(st.sets(st.integers(0, len(stream))))
-        sizes = [end - start for start, end in pairwise(sorted({0, *cuts, len(stream)}))]
-        assert read_in_pieces(stream, kind, sizes) == sent
-
-
-@pytest.mark.parametrize(
-    ("head", "body"),
-    [
-        (b"nothing", b""),
-        (b"[1, 1, {}]", b""),
-        (b"[1, 1, {}, [], 5]", b""),
-        (b'["1", 1, {}, []]', b""),
-        (b"[1, true, {}, []]", b""),
-        (b'[1, 1, {"a.x": "new"}, []]', b""),
-        (b'[1, 1, {}, [["a", "x", 3]]]', b"1234"),
-        (b'[1, 1, {}, [["a", "x", -4], ["a", "y", 8]]]', b"1234"),
-        (b'[1, 1, {}, [["a", 5, 4]]]', b"1234"),
-        (b'[1, 1, {}, [["a", 4]]]', b"1234"),
-        (b"[" * 100_000, b""),
-        (b"\xff", b""),
-    ],
-)
-def test_a_frame_that_is_no_step_is_refused_by_the_name_of_its_sender(
-    head: bytes, body: bytes
-) -> None:
-    frame = struct.pack("<II", len(head), len(body)) + head + body
-    with pytest.raises(ControlError, match=r"the session sent a frame that is no step: ."):
-        read_in_pieces(frame, Advance, [len(frame)])
 
 
 class Poll:
@@ -277,7 +237,7 @@ class Poll:
 
 def test_waits_in_vain_sleep_at_once_more_and_more_often(monkeypatch: pytest.MonkeyPatch) -> None:
     poll = Poll()
-    monkeypatch.setattr(step_module, "select", SimpleNamespace(poll=lambda: poll))
+    monkeypatch.setattr(link_module, "select", SimpleNamespace(poll=lambda: poll))
     arrivals, awake = Arrivals(), []
     for _ in range(1 + 1 + 1 + 3 + 1 + 7):
         assert arrivals.wait(5.0) == []

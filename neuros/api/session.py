@@ -33,11 +33,11 @@ from neuros.control import (
     Pause,
     Reset,
     Resume,
+    Settled,
     WasReset,
     Watch,
 )
 from neuros.control.link import ControlLink
-from neuros.control.steps import Advanced
 from neuros.errors import RunError, UsageError
 from neuros.project.graph import graph_svg
 from neuros.project.model import Node, Port
@@ -415,7 +415,7 @@ class Session:
     def _known(self) -> dict[str, int]:
         return {name: number for name, (number, _) in self._newest.items()}
 
-    def _note(self, settled: Advanced | None) -> bool:
+    def _note(self, settled: Settled | None) -> bool:
         if settled is not None:
             self._sim_times = settled.sim_times
             self._newest.update(settled.packets)

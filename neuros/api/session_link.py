@@ -16,9 +16,8 @@ from typing import Any
 
 from neuros.api.live import LiveRun
 from neuros.backends.control_sockets import SESSION_SOCKET_NAME, connect_unix
-from neuros.control import Deliver, Ended, Message, Settle, Settled, StepAll
-from neuros.control.link import ControlLink
-from neuros.control.steps import Advance, Advanced, Arrivals, StepLink
+from neuros.control import TO_SESSION, Advance, Deliver, Ended, Message, Settle, Settled, StepAll
+from neuros.control.link import Arrivals, ControlLink
 from neuros.errors import UsageError
 from neuros.project.model import Node, Port, Project
 from neuros.project.names import SESSION
@@ -55,7 +54,7 @@ class SessionLink:
     def __init__(self, supervisor: ControlLink, folder: Path) -> None:
         self._supervisor = supervisor
         self._folder = folder
-        self._nodes: StepLink[Advanced] | None = None
+        self._nodes: ControlLink | None = None
         self._arrivals = Arrivals()
         self._arrivals.register(supervisor)
         self._unsent: list[tuple[str, str, bytes]] = []
@@ -83,7 +82,7 @@ class SessionLink:
 
     def settle(
         self, known: Mapping[str, int], end_s: float | None = None, *, rounds: int = 0
-    ) -> Advanced | None:
+    ) -> Settled | None:
         """Go on by rounds, then wait until nothing moves, both by the supervisor.
 
         What has been said to the supervisor comes before. See :meth:`advance`.
@@ -108,10 +107,9 @@ class SessionLink:
         if self._nodes is None:
             with contextlib.suppress(OSError):  # they are in several processes, or out of reach
                 stream = connect_unix(self._folder / SESSION_SOCKET_NAME)
-                self._nodes = StepLink(stream, Advanced, "the nodes")
+                self._nodes = ControlLink(stream, TO_SESSION, "the nodes")
                 self._arrivals.register(stream)
-        packets = {name: (newest.number, newest.data) for name, newest in found[0].packets.items()}
-        return Advanced(self._number, found[0].sim_times, packets)
+        return found[0]
 
     def advance(
         self,
@@ -119,7 +117,7 @@ class SessionLink:
         known: Mapping[str, int],
         end_s: float | None,
         end_sim_s: float | None = None,
-    ) -> Advanced | None:
+    ) -> Settled | None:
         """Go on by rounds, then wait until nothing moves.
 
         While an answer of the nodes is due (a step was given up), this goes by the supervisor, as
@@ -187,7 +185,7 @@ class SessionLink:
             is_over = is_over or isinstance(message, Ended)
         return False if is_over else None
 
-    def _hear_answer(self, end_s: float | None) -> Advanced | None:
+    def _hear_answer(self, end_s: float | None) -> Settled | None:
         """What the nodes answer; ``None`` if the run has ended."""
         while self._nodes is not None:
             is_over = False
@@ -201,13 +199,14 @@ class SessionLink:
         self.wait_for(lambda _: False, end_s)  # the supervisor says why they have gone
         return None
 
-    def _hear_nodes(self) -> list[Advanced]:
+    def _hear_nodes(self) -> list[Settled]:
         """The answer to the last step, once it has come."""
         assert self._nodes is not None
-        answers = self._nodes.receive()
-        if answers is None:
+        received = self._nodes.receive()
+        if received is None:
             self.leave_nodes()
             return []
+        answers = [each for each in received if isinstance(each, Settled)]
         self._is_due = self._is_due and not answers
         return answers
 
@@ -218,7 +217,7 @@ class SessionLink:
 
     def _send_to(
         self,
-        nodes: StepLink[Advanced],
+        nodes: ControlLink,
         rounds: int,
         known: Mapping[str, int],
         end_sim_s: float | None = None,

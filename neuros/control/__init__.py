@@ -2,8 +2,8 @@
 
 It is not part of the data path: nodes report once per second, on a change of state and at the end;
 the supervisor answers rarely. Observers (the dashboard) get no more than they ask for. Every
-message is a class of this module; :data:`FROM_NODES`, :data:`TO_NODES`, :data:`FROM_OBSERVERS`
-and :data:`TO_OBSERVERS` say who sends which.
+message is a class of this module; :data:`FROM_NODES`, :data:`TO_NODES`, :data:`FROM_OBSERVERS`,
+:data:`TO_OBSERVERS`, :data:`FROM_SESSION` and :data:`TO_SESSION` say who sends which.
 
 A message travels as MessagePack, behind its length: a map with its fields and ``kind``, the name of
 its class in snake_case. The bytes go through any :class:`neuros.ports.ControlStream`; the back end
@@ -248,13 +248,6 @@ class NodeStatus(Message):
     samples: Mapping[str, dict[str, Any]] = {}
 
 
-class NewestPacket(msgspec.Struct, forbid_unknown_fields=True):
-    """The newest packet of an output: its number, from 1, and its ROS serialisation."""
-
-    number: int
-    data: bytes
-
-
 class AtRest(Message):
     """No event waits in a node process, and no hook may start: answer to ``settle``.
 
@@ -263,7 +256,8 @@ class AtRest(Message):
         sent: by connection to another process, packets sent and acknowledged; -1: it may lose some.
         received: by connection from another process, likewise.
         sim_times: of nodes that own simulated time, in seconds.
-        packets: by output (``robot.imu``), the packet, if it is newer than the known number.
+        packets: by output (``robot.imu``), the number of its newest packet, from 1, and its ROS
+            serialisation; only if it is newer than the known number.
     """
 
     nodes: tuple[str, ...]
@@ -272,7 +266,7 @@ class AtRest(Message):
     sent: Mapping[str, tuple[int, int]]
     received: Mapping[str, tuple[int, int]]
     sim_times: Mapping[str, float]
-    packets: Mapping[str, NewestPacket]
+    packets: Mapping[str, tuple[int, bytes]]
 
 
 class WasReset(Message):
@@ -365,6 +359,27 @@ class Deliver(Message):
     data: bytes
 
 
+# ---------------------------------------------------------------------- from a session to its nodes
+
+
+class Advance(Message):
+    """While paused, take packets and run steps; answer `settled` once nothing moves, and pause.
+
+    Attributes:
+        rounds: so many steps.
+        known: outputs whose packets are asked for, and the number of the newest known packet.
+        packets: node, input and content of each packet of the session.
+        end_sim_s: a simulated time at which no further step begins; each step waits for the one
+            before then.
+    """
+
+    number: int
+    rounds: int
+    known: Mapping[str, int]
+    packets: tuple[tuple[str, str, bytes], ...] = ()
+    end_sim_s: float | None = None
+
+
 # ---------------------------------------------------------------------- from observers
 
 
@@ -405,11 +420,11 @@ class PhaseChanged(Message):
 
 
 class Settled(Message):
-    """Nothing moves in the whole run; in answer to ``settle``. Fields as in ``at_rest``."""
+    """Nothing moves in the whole run: answer to ``settle`` or ``advance``. As in ``at_rest``."""
 
     number: int
     sim_times: Mapping[str, float]
-    packets: Mapping[str, NewestPacket]
+    packets: Mapping[str, tuple[int, bytes]]
 
 
 class LogRecord(Message):
@@ -445,6 +460,8 @@ TO_NODES: Sequence[type[Message]] = (
     *(Begin, Activate, Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
     *(Settle, Deliver, Reset),
 )
+FROM_SESSION: Sequence[type[Message]] = (Advance,)
+TO_SESSION: Sequence[type[Message]] = (Settled,)
 FROM_OBSERVERS: Sequence[type[Message]] = (
     *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Settle, Deliver, Reset),
 )

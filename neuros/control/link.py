@@ -6,7 +6,10 @@ Each message is MessagePack behind its length, a ``uint32`` (little-endian).
 from __future__ import annotations
 
 import functools
+import os
 import re
+import select
+import time
 from collections.abc import Sequence
 from typing import Any, TypeVar, Union
 
@@ -21,6 +24,8 @@ _LONGEST_BYTES = 1 << 29
 """Text of another protocol, whose first four bytes count as a length, claims more than this."""
 _READ_BYTES, _MOST_READ_BYTES = 1 << 16, 1 << 20
 _LONGEST_SHOWN = 60
+_SPIN_NS = 250_000
+_MOST_SLEPT = 64
 _PLAIN: tuple[type[Any], ...] = (str, float, int, dict)
 _NO_CHARACTER = re.compile("[\ud800-\udfff]")
 _Declared = TypeVar("_Declared")
@@ -131,6 +136,42 @@ class ControlLink:
     def close(self) -> None:
         """Hang up."""
         self.stream.close()
+
+
+class Arrivals:
+    """Waits until one of several descriptors is readable.
+
+    It takes about as long to wake a process that sleeps as to do half of a step. So it does not
+    sleep for the first quarter of a millisecond. If that was in vain (the step is a long one, or
+    its other end has no core to run on), the next wait sleeps at once; then the next three, the
+    next seven, and so on.
+    """
+
+    def __init__(self) -> None:
+        self._poll = select.poll()
+        self._slept = self._to_sleep = 0
+
+    def register(self, stream: Any) -> None:
+        """Wait for this one, too."""
+        self._poll.register(stream, select.POLLIN)
+
+    def unregister(self, stream: Any) -> None:
+        """Wait for it no more."""
+        self._poll.unregister(stream)
+
+    def wait(self, timeout_ms: float | None) -> list[int]:
+        """The descriptors that are readable or at their end; empty if none becomes so in time."""
+        if self._to_sleep:
+            self._to_sleep -= 1
+        else:
+            end_ns = time.monotonic_ns() + _SPIN_NS
+            while time.monotonic_ns() < end_ns:
+                if found := self._poll.poll(0):
+                    self._slept = 0
+                    return [number for number, _ in found]
+                os.sched_yield()
+            self._slept = self._to_sleep = min(2 * self._slept + 1, _MOST_SLEPT)
+        return [number for number, _ in self._poll.poll(timeout_ms)]
 
 
 def encode(message: Message) -> bytes:

@@ -386,7 +386,7 @@ class Settling:
         self._pause_s = 0.0
         self._due_s: float | None = None
         self._answers: dict[tuple[str, ...], control.AtRest] = {}
-        self._packets: dict[str, control.NewestPacket] = {}
+        self._packets: dict[str, tuple[int, bytes]] = {}
         self._last: tuple[Counts, Counts] | None = None
         self._last_s = 0.0
 
@@ -428,7 +428,7 @@ class Settling:
             return
         self._round += 1
         self._answers.clear()
-        known = {name: packet.number for name, packet in self._packets.items()}
+        known = {name: number for name, (number, _) in self._packets.items()}
         self._channels.send(control.Settle(self._round, {**self._asked.known, **known}))
 
     def _ask_later(self) -> None:

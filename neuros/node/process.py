@@ -16,9 +16,8 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import neuros.control as control
-from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Message
+from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Advance, Message
 from neuros.control.link import ControlLink
-from neuros.control.steps import Advance
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import LoggedEngine
 from neuros.errors import ControlError, NeurosError
@@ -226,8 +225,9 @@ class NodeProcess:
                 node.reports.probe(number, is_idle=is_idle, has_free_threads=has_free_threads)
             )
 
-    def _advance(self, step: Advance) -> None:
+    def _advance(self, step: Message) -> None:
         """Do a step of the session, if the run is not at its end."""
+        assert isinstance(step, Advance)
         for name, input_name, content in step.packets:
             if name not in self._by_name:
                 raise ControlError(f"a packet came for '{name}.{input_name}', no session's input")
@@ -242,7 +242,8 @@ class NodeProcess:
     def _begin_rounds(self, step: Advance) -> None:
         """Begin those of a step, or the next one where it ends at a time."""
         count = step.rounds if step.end_sim_s is None else min(step.rounds, 1)
-        self._step = step._replace(rounds=step.rounds - count)
+        self._step = step
+        step.rounds -= count
         if count:
             engines = [node.engine for node in self._nodes if node.engine is not None]
             is_driven = any(engine.is_driving for engine in engines)
@@ -583,7 +584,7 @@ def _at_rest(nodes: Sequence[NodeRuntime], asked: control.Settle) -> control.AtR
     windows = [w for engine in engines for w in engine.send_windows.values()]
     subscriptions = [s for engine in engines for s in engine.subscriptions.values()]
     packets = {
-        f"{node.name}.{output}": control.NewestPacket(number, data)
+        f"{node.name}.{output}": (number, data)
         for node in nodes
         for output, (number, data) in node.newest.by_output.items()
         if number > asked.known.get(f"{node.name}.{output}", number)

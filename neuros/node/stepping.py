@@ -14,7 +14,8 @@ import selectors
 import socket
 from collections.abc import Callable, Mapping
 
-from neuros.control.steps import Advance, Advanced, Arrivals, StepLink
+from neuros.control import FROM_SESSION, Advance, Message, Settled
+from neuros.control.link import Arrivals, ControlLink
 from neuros.node.node import NodeRuntime
 from neuros.ports import ControlListener
 
@@ -35,13 +36,13 @@ class SessionSteps:
     def __init__(
         self,
         listener: ControlListener,
-        advance: Callable[[Advance], None],
+        advance: Callable[[Message], None],
         post: Callable[[Callable[[], None]], None],
     ) -> None:
         self._listener = listener
         self._advance = advance
         self._post = post
-        self._link: StepLink[Advance] | None = None
+        self._link: ControlLink | None = None
         self._waker = os.eventfd(0, os.EFD_NONBLOCK)
         self._is_waiting = False
         self._arrivals = Arrivals()
@@ -56,7 +57,7 @@ class SessionSteps:
         stream = self._listener.accept()
         if stream is not None:
             self._selector.unregister(self._listener)
-            self._link = StepLink(stream, Advance, "the session")
+            self._link = ControlLink(stream, FROM_SESSION, "the session")
             self._arrivals.register(stream)
             self.watch()
         return True
@@ -109,7 +110,7 @@ class SessionSteps:
             if newest is not None and newest[0] > known:
                 packets[name] = newest
         times = {name: float(s) for name, node in nodes.items() if (s := node.sim_time) is not None}
-        self._link.send(Advanced(asked.number, times, packets))
+        self._link.send(Settled(asked.number, times, packets))
 
     def wake(self) -> None:
         """Let the loop wait for no step, for there is something else to do. Any thread."""

@@ -34,6 +34,7 @@ from neuros.backends.control_sockets import connect
 from neuros.cli.main import main
 from neuros.control import (
     TO_OBSERVERS,
+    Advance,
     AtRest,
     Deliver,
     LogRecord,
@@ -44,7 +45,6 @@ from neuros.control import (
     Watch,
 )
 from neuros.control.link import ControlLink
-from neuros.control.steps import Advance
 from neuros.errors import ProjectError, RunError, UsageError
 from neuros.launcher.supervisor import Supervisor
 
@@ -614,7 +614,7 @@ def test_a_step_that_arrives_once_the_run_goes_freely_does_not_hold_it(tmp_path:
         s._link.send(Resume())
         looks = s.folder / "eye" / "looks"
         wait_until(looks.exists)
-        nodes.send(Advance(10_000, 1, {}, ()))
+        nodes.send(Advance(10_000, 1, {}))
         assert select.select([nodes], [], [], DEADLINE_S)[0]
         before = looks.stat().st_size
         wait_until(lambda: looks.stat().st_size > before + 3)

@@ -40,7 +40,6 @@ from neuros.api.run_record import open_run
 from neuros.api.verify import RecordedPackets, compare
 from neuros.cli.main import main
 from neuros.control.link import ControlLink, decode, decoder_of, to_bytes
-from neuros.control.steps import Advance, Advanced, StepLink
 from neuros.engine.event_log import Script
 from neuros.errors import ControlError, NeurosError, ProtocolError
 from neuros.launcher.peers import RUNNING, PeerState, state_from
@@ -482,46 +481,19 @@ SENT: Sequence[control.Message] = (
     control.End("done"),
     control.PhaseChanged("running", is_paused=False),
     control.Ended(0, "done", {}, 1.0, None),
+    control.Advance(3, 1, {"a.x": 2}, (("a", "y", b"12345678"),)),
+    control.Settled(3, {"a": 0.5}, {"a.x": (3, b"1234"), "a.z": (1, b"")}),
 )
 
 
 @target(lambda: [to_bytes(each) for each in SENT], change_bytes)
 def control_message(data: bytes, _: Path) -> None:
     for group in (control.FROM_NODES, control.TO_NODES, control.FROM_OBSERVERS,
-                  control.TO_OBSERVERS):  # fmt: skip
+                  control.TO_OBSERVERS, control.FROM_SESSION):  # fmt: skip
         decoder = decoder_of(tuple(group))
         with allowed(ControlError):
             message = to_bytes(decode(data, decoder, "a"))
             assert to_bytes(decode(message, decoder, "a")) == message
-
-
-STEPS: Sequence[Advance | Advanced] = (
-    Advance(3, 1, {"a.x": 2}, [("a", "y", b"12345678")]),
-    Advanced(3, {"a": 0.5}, {"a.x": (3, b"1234"), "a.z": (1, b"")}),
-)
-
-
-@target(lambda: [each.to_frame() for each in STEPS], change_bytes)
-def step_frames(data: bytes, _: Path) -> None:
-    for kind in (Advance, Advanced):
-        ours, theirs = socket.socketpair()
-        with ours, theirs:
-            ours.sendall(data[:50_000])  # what fits into the buffer of a socket
-            ours.shutdown(socket.SHUT_WR)  # else `receive` waits for ever where there is none
-            link: StepLink[Any] = StepLink(theirs, kind, "a")
-            rest = data
-            with allowed(ControlError):
-                for message in link.receive() or ():
-                    head, body, rest = _frame_and_rest(rest)
-                    assert _frame_and_rest(message.to_frame()) == (head, body, b"")
-
-
-def _frame_and_rest(data: bytes) -> tuple[str, bytes, bytes]:
-    """What JSON reads in the head of the first frame, its body, and what comes after it."""
-    head_length, body_length = struct.unpack_from("<II", data)
-    head_end = 8 + head_length
-    end = head_end + body_length
-    return json.dumps(json.loads(data[8:head_end])), data[head_end:end], data[end:]
 
 
 @target(

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuros.control import AtRest, Message, NewestPacket, Pause, Settle, Settled
+from neuros.control import AtRest, Message, Pause, Settle, Settled
 from neuros.control.link import ControlLink
 from neuros.launcher.channels import Channels, Settling
 
@@ -132,7 +132,7 @@ def test_one_process_is_asked_once(asked: Asked) -> None:
     settling = Settling(["a", "b"], cast(Channels, asked))
     settling.ask(SESSION, Settle(1, {"a.x": 3}))
     assert asked.rounds == [Settle(1, {"a.x": 3})]
-    newest = {"a.x": NewestPacket(4, "")}
+    newest = {"a.x": (4, b"")}
     settling.take(AtRest(("a", "b"), 1, True, {}, {}, {"a": 0.5}, newest))
     assert asked.told == [Settled(1, {"a": 0.5}, newest)]
 

@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 
 from containers import wait_until
-from neuros.control.steps import Advance, Advanced, StepLink
+from neuros.control import TO_SESSION, Advance, Message
+from neuros.control.link import ControlLink, encode
 from neuros.node.stepping import SessionSteps
 
-STEP = Advance(1, 1, {}, [])
+STEP = Advance(1, 1, {})
 
 
 class Listener:
@@ -42,14 +43,14 @@ class Process:
     def __init__(self) -> None:
         listener: Any = Listener()
         self.steps = SessionSteps(listener, self._advance, self.post)
-        self.session = StepLink(listener.ours, Advanced, "the nodes")
+        self.session = ControlLink(listener.ours, TO_SESSION, "the nodes")
         self.selector = selectors.DefaultSelector()
         self.events: list[Callable[[], None]] = []
-        self.done: list[Advance] = []
+        self.done: list[Message] = []
         self.steps.listen(self.selector)
         self.hear()
 
-    def _advance(self, step: Advance) -> None:
+    def _advance(self, step: Message) -> None:
         self.done.append(step)
 
     def post(self, event: Callable[[], None]) -> None:
@@ -119,11 +120,11 @@ def test_what_the_loop_has_to_do_ends_its_waiting(
 
 
 def test_a_step_in_two_parts_is_done_once_it_is_whole(process: Process) -> None:
-    frame = STEP.to_frame()
-    process.session._stream.sendall(frame[:9])
+    frame = encode(STEP)
+    process.session.stream.sendall(frame[:9])
     process.hear()
     process.steps.take()
     assert process.done == []
-    process.session._stream.sendall(frame[9:])
+    process.session.stream.sendall(frame[9:])
     process.events.pop()()
     assert process.done == [STEP]
