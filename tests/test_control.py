@@ -22,10 +22,10 @@ from neuros import control
 from neuros.control import (
     FROM_NODES,
     FROM_OBSERVERS,
-    FROM_SESSION,
     TO_NODES,
     TO_OBSERVERS,
     Advance,
+    AtRest,
     Ended,
     Finalising,
     HookDeclaration,
@@ -36,7 +36,6 @@ from neuros.control import (
     NodeStatus,
     Probed,
     Report,
-    Settled,
 )
 from neuros.control import link as link_module
 from neuros.control.link import (
@@ -53,7 +52,7 @@ from neuros.hooks import HookKind, InputSpec
 from neuros.stacks import Stack
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "control_channel.md"
-MESSAGES = dict.fromkeys([*FROM_NODES, *TO_NODES, *FROM_OBSERVERS, *TO_OBSERVERS, *FROM_SESSION])
+MESSAGES = dict.fromkeys([*FROM_NODES, *TO_NODES, *FROM_OBSERVERS, *TO_OBSERVERS])
 DECODER = decoder_of(tuple(MESSAGES))
 METRICS: Any = {"state": {"state": "idle", "cause": ""}, "executing": None, "hooks": {}}
 METRICS |= {"outgoing": {}, "incoming": {}, "accounting": {}}
@@ -83,7 +82,7 @@ RICH = [
     Ended(0, "why", {"a": REPORT}, 2.0, 0.5, True),
     Finalising("a", None),
     Advance(7, 2, {"a.o": 3}, (("a", "x", b"abcd"), ("a", "y", b""))),
-    Settled(7, {"a": 0.25}, {"a.o": (4, bytes(200_000)), "a.p": (1, b"")}),
+    AtRest(7, {"a": 0.25}, {"a.o": (4, bytes(200_000)), "a.p": (1, b"")}),
 ]
 
 
@@ -215,7 +214,6 @@ def table(kinds: Any) -> str:
         ("To node processes", TO_NODES),
         ("From an observer", FROM_OBSERVERS),
         ("To observers", TO_OBSERVERS),
-        ("From a session to its nodes", FROM_SESSION),
     ],
 )
 def test_the_page_shows_the_messages_as_they_are(title: str, kinds: Any) -> None:

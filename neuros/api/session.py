@@ -27,13 +27,13 @@ from neuros.api.session_link import Held, SessionLink, connections_to, declared_
 from neuros.backends.control_sockets import connect
 from neuros.control import (
     TO_OBSERVERS,
+    AtRest,
     LookAll,
     Message,
     NodeStatus,
     Pause,
     Reset,
     Resume,
-    Settled,
     WasReset,
     Watch,
 )
@@ -415,7 +415,7 @@ class Session:
     def _known(self) -> dict[str, int]:
         return {name: number for name, (number, _) in self._newest.items()}
 
-    def _note(self, settled: Settled | None) -> bool:
+    def _note(self, settled: AtRest | None) -> bool:
         if settled is not None:
             self._sim_times = settled.sim_times
             self._newest.update(settled.packets)

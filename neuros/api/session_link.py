@@ -16,7 +16,7 @@ from typing import Any
 
 from neuros.api.live import LiveRun
 from neuros.backends.control_sockets import SESSION_SOCKET_NAME, connect_unix
-from neuros.control import TO_SESSION, Advance, Deliver, Ended, Message, Settle, Settled, StepAll
+from neuros.control import TO_SESSION, Advance, AtRest, Deliver, Ended, Message
 from neuros.control.link import Arrivals, ControlLink
 from neuros.errors import UsageError
 from neuros.project.model import Node, Port, Project
@@ -82,20 +82,18 @@ class SessionLink:
 
     def settle(
         self, known: Mapping[str, int], end_s: float | None = None, *, rounds: int = 0
-    ) -> Settled | None:
+    ) -> AtRest | None:
         """Go on by rounds, then wait until nothing moves, both by the supervisor.
 
         What has been said to the supervisor comes before. See :meth:`advance`.
         """
         self._catch_up()
         self._number += 1
-        if rounds:
-            self._supervisor.send(StepAll(rounds))
-        self._supervisor.send(Settle(self._number, known))
-        found: list[Settled] = []
+        self._supervisor.send(Advance(self._number, rounds, known))
+        found: list[AtRest] = []
 
         def is_answer(message: Message) -> bool:
-            if isinstance(message, Settled) and message.number == self._number:
+            if isinstance(message, AtRest) and message.number == self._number:
                 found.append(message)
             return bool(found)
 
@@ -117,7 +115,7 @@ class SessionLink:
         known: Mapping[str, int],
         end_s: float | None,
         end_sim_s: float | None = None,
-    ) -> Settled | None:
+    ) -> AtRest | None:
         """Go on by rounds, then wait until nothing moves.
 
         While an answer of the nodes is due (a step was given up), this goes by the supervisor, as
@@ -185,7 +183,7 @@ class SessionLink:
             is_over = is_over or isinstance(message, Ended)
         return False if is_over else None
 
-    def _hear_answer(self, end_s: float | None) -> Settled | None:
+    def _hear_answer(self, end_s: float | None) -> AtRest | None:
         """What the nodes answer; ``None`` if the run has ended."""
         while self._nodes is not None:
             is_over = False
@@ -199,14 +197,14 @@ class SessionLink:
         self.wait_for(lambda _: False, end_s)  # the supervisor says why they have gone
         return None
 
-    def _hear_nodes(self) -> list[Settled]:
+    def _hear_nodes(self) -> list[AtRest]:
         """The answer to the last step, once it has come."""
         assert self._nodes is not None
         received = self._nodes.receive()
         if received is None:
             self.leave_nodes()
             return []
-        answers = [each for each in received if isinstance(each, Settled)]
+        answers = [each for each in received if isinstance(each, AtRest)]
         self._is_due = self._is_due and not answers
         return answers
 

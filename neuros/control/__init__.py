@@ -249,24 +249,28 @@ class NodeStatus(Message):
 
 
 class AtRest(Message):
-    """No event waits in a node process, and no hook may start: answer to ``settle``.
+    """Nothing moves, and no hook may start: answer to `advance`.
+
+    Of a node process to the supervisor: no event waits there. Of the supervisor or the process with
+    all nodes to a session: in the whole run.
 
     Attributes:
-        is_active: whether each node has found its receivers, and may start all its hooks.
-        sent: by connection to another process, packets sent and acknowledged; -1: it may lose some.
-        received: by connection from another process, likewise.
         sim_times: of nodes that own simulated time, in seconds.
         packets: by output (``robot.imu``), the number of its newest packet, from 1, and its ROS
             serialisation; only if it is newer than the known number.
+        nodes: of the process.
+        is_active: whether each node has found its receivers, and may start all its hooks.
+        sent: by connection to another process, packets sent and acknowledged; -1: it may lose some.
+        received: by connection from another process, likewise.
     """
 
-    nodes: tuple[str, ...]
     number: int
-    is_active: bool
-    sent: Mapping[str, tuple[int, int]]
-    received: Mapping[str, tuple[int, int]]
     sim_times: Mapping[str, float]
     packets: Mapping[str, tuple[int, bytes]]
+    nodes: tuple[str, ...] = ()
+    is_active: bool = True
+    sent: Mapping[str, tuple[int, int]] = {}
+    received: Mapping[str, tuple[int, int]] = {}
 
 
 class WasReset(Message):
@@ -338,32 +342,8 @@ class Look(Message):
     asker: int
 
 
-class Settle(Message):
-    """While paused, answer once nothing moves; ``known``: newest known packet number, by output."""
-
-    number: int
-    known: Mapping[str, int]
-
-
-class Reset(Message):
-    """While paused, return to the start and stay paused; ``variables``: environments, by node."""
-
-    variables: Mapping[str, Mapping[str, str]]
-
-
-class Deliver(Message):
-    """A packet of a session for one of its inputs."""
-
-    node: str
-    input: str
-    data: bytes
-
-
-# ---------------------------------------------------------------------- from a session to its nodes
-
-
 class Advance(Message):
-    """While paused, take packets and run steps; answer `settled` once nothing moves, and pause.
+    """While paused, take packets and run steps; answer `at_rest` once nothing moves, and pause.
 
     Attributes:
         rounds: so many steps.
@@ -378,6 +358,20 @@ class Advance(Message):
     known: Mapping[str, int]
     packets: tuple[tuple[str, str, bytes], ...] = ()
     end_sim_s: float | None = None
+
+
+class Reset(Message):
+    """While paused, return to the start and stay paused; ``variables``: environments, by node."""
+
+    variables: Mapping[str, Mapping[str, str]]
+
+
+class Deliver(Message):
+    """A packet of a session for one of its inputs."""
+
+    node: str
+    input: str
+    data: bytes
 
 
 # ---------------------------------------------------------------------- from observers
@@ -419,14 +413,6 @@ class PhaseChanged(Message):
     is_paused: bool
 
 
-class Settled(Message):
-    """Nothing moves in the whole run: answer to ``settle`` or ``advance``. As in ``at_rest``."""
-
-    number: int
-    sim_times: Mapping[str, float]
-    packets: Mapping[str, tuple[int, bytes]]
-
-
 class LogRecord(Message):
     """Message of the launcher to the user."""
 
@@ -458,13 +444,13 @@ FROM_NODES: Sequence[type[Message]] = (
 )
 TO_NODES: Sequence[type[Message]] = (
     *(Begin, Activate, Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
-    *(Settle, Deliver, Reset),
+    *(Advance, Deliver, Reset),
 )
 FROM_SESSION: Sequence[type[Message]] = (Advance,)
-TO_SESSION: Sequence[type[Message]] = (Settled,)
+TO_SESSION: Sequence[type[Message]] = (AtRest,)
 FROM_OBSERVERS: Sequence[type[Message]] = (
-    *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Settle, Deliver, Reset),
+    *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Advance, Deliver, Reset),
 )
 TO_OBSERVERS: Sequence[type[Message]] = (
-    *(NodeStatus, PhaseChanged, LogRecord, Ended, Settled, WasReset),
+    *(NodeStatus, PhaseChanged, LogRecord, Ended, AtRest, WasReset),
 )

@@ -360,7 +360,7 @@ Counts: TypeAlias = Mapping[str, tuple[int, int]]
 
 
 class Settling:
-    """Answers ``settle`` of a session: once all nodes are active, and nothing moves.
+    """Answers ``advance`` of a session: once all nodes are active, and nothing moves.
 
     The run is paused: this is the end of a step. Each node process answers when no event waits in
     it, and none starts anything unasked. They answer at different instants, but with counters by
@@ -381,7 +381,7 @@ class Settling:
         self._channels = channels
         self._clock = clock
         self._asker: ControlLink | None = None
-        self._asked = control.Settle(0, {})
+        self._asked = control.Advance(0, 0, {})
         self._round = 0
         self._pause_s = 0.0
         self._due_s: float | None = None
@@ -395,7 +395,7 @@ class Settling:
         """Seconds until :meth:`look` has something to do."""
         return _NEVER_S if self._due_s is None else max(0.0, self._due_s - self._clock())
 
-    def ask(self, asker: ControlLink, message: control.Settle) -> None:
+    def ask(self, asker: ControlLink, message: control.Advance) -> None:
         """Find out from now on, and answer this one; what was asked before is answered no more."""
         self._asker, self._asked = asker, message
         self._packets.clear()
@@ -429,7 +429,7 @@ class Settling:
         self._round += 1
         self._answers.clear()
         known = {name: number for name, (number, _) in self._packets.items()}
-        self._channels.send(control.Settle(self._round, {**self._asked.known, **known}))
+        self._channels.send(control.Advance(self._round, 0, {**self._asked.known, **known}))
 
     def _ask_later(self) -> None:
         self._pause_s = min(max(2 * self._pause_s, _FIRST_LOOK_S), _RAREST_LOOK_S)
@@ -457,9 +457,8 @@ class Settling:
         self._asker = None
         self._channels.send(control.Pause())  # takes back what hooks could not use of a step
         times = {n: t for answer in self._answers.values() for n, t in answer.sim_times.items()}
-        self._channels.send_to(
-            asker, control.Settled(self._asked.number, times, dict(self._packets))
-        )
+        answer = control.AtRest(self._asked.number, times, dict(self._packets))
+        self._channels.send_to(asker, answer)
 
 
 def _joined(parts: Iterable[Counts]) -> Counts:

@@ -237,7 +237,10 @@ class Supervisor:
                     self._output.log("WARN", f"{node} {'; '.join(lines)}")
             case control.Heard(node, text):
                 self._peers.hear(node, text, time.monotonic())
-            case control.Settle():
+            case control.Advance():
+                for packet in message.packets:
+                    self.observers.take(link, control.Deliver(*packet))
+                self.pause.step(message.rounds, is_driven=self._detector.is_driven)
                 self._settling.ask(link, message)
             case control.AtRest():
                 if self._shutdown.phase is Phase.RUNNING:  # else the session hears of the end

@@ -80,7 +80,7 @@ class NodeProcess:
         self._early_events: list[Event] = []
         self._early_lock = threading.Lock()
         self._has_failed = False
-        self._asked: control.Settle | None = None
+        self._asked: Advance | None = None
         self._is_paused = False
         self._step: Advance | None = None
         self._is_settling = False
@@ -150,7 +150,7 @@ class NodeProcess:
         if isinstance(message, control.Probe):
             self._probe(message.number)
             return
-        if isinstance(message, control.Settle):
+        if isinstance(message, Advance):
             self._asked = message
             self._begin_settling()
             return
@@ -267,7 +267,7 @@ class NodeProcess:
         step, self._asked, self._step = self._step, None, None
         if step is not None:
             assert self._steps is not None
-            self._steps.answer(step, self._by_name)
+            self._steps.answer(_at_rest(self._nodes, step))
             self._steps.watch()
 
     def _settle(self) -> None:
@@ -295,13 +295,13 @@ class NodeProcess:
         self._is_settling = False
         if step is not None and not is_over:
             assert self._steps is not None
-            self._steps.answer(step, self._by_name)
+            self._steps.answer(_at_rest(self._nodes, step))
             if asked is None:
                 loop.post_loop_back(self._steps.take)
             else:
                 self._steps.watch()  # what the supervisor says next comes before the next step
         if asked is not None and not self.is_ending:
-            self._tell(_at_rest(self._nodes, asked))
+            self._tell(_with_counters(_at_rest(self._nodes, asked), self._nodes))
 
     def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:
         """Bring all nodes back to their start, once no event waits, if they can be."""
@@ -577,35 +577,36 @@ def signals_as_socket() -> Iterator[tuple[socket.socket, socket.socket]]:
         writer.close()
 
 
-def _at_rest(nodes: Sequence[NodeRuntime], asked: control.Settle) -> control.AtRest:
-    """State of all nodes of a process at one moment."""
-    names = tuple(node.name for node in nodes)
-    engines = [node.engine for node in nodes if node.engine is not None]
-    windows = [w for engine in engines for w in engine.send_windows.values()]
-    subscriptions = [s for engine in engines for s in engine.subscriptions.values()]
+def _at_rest(nodes: Sequence[NodeRuntime], asked: Advance) -> control.AtRest:
+    """Times and newest packets of all nodes of a process at one moment."""
     packets = {
-        f"{node.name}.{output}": (number, data)
+        name: newest
         for node in nodes
-        for output, (number, data) in node.newest.by_output.items()
-        if number > asked.known.get(f"{node.name}.{output}", number)
+        for output, newest in node.newest.by_output.items()
+        if newest[0] > asked.known.get(name := f"{node.name}.{output}", newest[0])
     }
-    return control.AtRest(
-        names,
-        asked.number,
-        len(engines) == len(nodes) and all(engine.is_active for engine in engines),
-        {
-            str(w.connection): (w.sent, w.acknowledged if w.is_reliable else -1)
-            for w in windows
-            if w.connection.destination_node not in names
-        },
-        {
-            s.name: (s.received, s.acknowledged if s.is_acknowledged else -1)
-            for s in subscriptions
-            if isinstance(s.key, Connection) and s.key.source_node not in names
-        },
-        {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None},
-        packets,
-    )
+    times = {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None}
+    return control.AtRest(asked.number, times, packets)
+
+
+def _with_counters(answer: control.AtRest, nodes: Sequence[NodeRuntime]) -> control.AtRest:
+    """The answer with what the supervisor compares with those of other processes."""
+    answer.nodes = names = tuple(node.name for node in nodes)
+    engines = [node.engine for node in nodes if node.engine is not None]
+    answer.is_active = len(engines) == len(nodes) and all(e.is_active for e in engines)
+    answer.sent = {
+        str(w.connection): (w.sent, w.acknowledged if w.is_reliable else -1)
+        for engine in engines
+        for w in engine.send_windows.values()
+        if w.connection.destination_node not in names
+    }
+    answer.received = {
+        s.name: (s.received, s.acknowledged if s.is_acknowledged else -1)
+        for engine in engines
+        for s in engine.subscriptions.values()
+        if isinstance(s.key, Connection) and s.key.source_node not in names
+    }
+    return answer
 
 
 def _filenames(error: BaseException) -> Iterator[str]:

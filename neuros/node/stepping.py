@@ -12,11 +12,10 @@ import contextlib
 import os
 import selectors
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
-from neuros.control import FROM_SESSION, Advance, Message, Settled
+from neuros.control import FROM_SESSION, AtRest, Message
 from neuros.control.link import Arrivals, ControlLink
-from neuros.node.node import NodeRuntime
 from neuros.ports import ControlListener
 
 _LINGER_MS = 2
@@ -100,17 +99,10 @@ class SessionSteps:
         for step in steps:
             self._advance(step)
 
-    def answer(self, asked: Advance, nodes: Mapping[str, NodeRuntime]) -> None:
+    def answer(self, answer: AtRest) -> None:
         """Tell the session that nothing moves any more. Loop thread only."""
         assert self._link is not None
-        packets = {}
-        for name, known in asked.known.items():
-            node, _, output = name.partition(".")
-            newest = nodes[node].newest.by_output.get(output) if node in nodes else None
-            if newest is not None and newest[0] > known:
-                packets[name] = newest
-        times = {name: float(s) for name, node in nodes.items() if (s := node.sim_time) is not None}
-        self._link.send(Settled(asked.number, times, packets))
+        self._link.send(answer)
 
     def wake(self) -> None:
         """Let the loop wait for no step, for there is something else to do. Any thread."""

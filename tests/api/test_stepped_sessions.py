@@ -40,8 +40,6 @@ from neuros.control import (
     LogRecord,
     Message,
     Resume,
-    Settle,
-    StepAll,
     Watch,
 )
 from neuros.control.link import ControlLink
@@ -341,7 +339,7 @@ def test_a_step_goes_straight_to_the_process_that_holds_all_nodes(
     held.send("robot.push", Float64(data=1.0))
     held.step(3, timeout_s=DEADLINE_S)
     assert held["robot.pose"].count == before + 3
-    assert not {StepAll, Settle, AtRest, Deliver}.intersection(heard)
+    assert not {Advance, AtRest, Deliver}.intersection(heard)
 
 
 def test_a_step_goes_by_the_supervisor_where_the_nodes_are_out_of_reach(
@@ -549,7 +547,7 @@ def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_f
         assert s["robot.pose"].count == 0
         with pytest.raises(TimeoutError):
             s.step(timeout_s=0.5)
-        s._link._supervisor.send(Settle(10_000, {}))
+        s._link._supervisor.send(Advance(10_000, 0, {}))
         (s.folder / "brain" / "go").touch()
         s.step(timeout_s=DEADLINE_S)
         assert s["robot.pose"].count == 2

@@ -482,14 +482,14 @@ SENT: Sequence[control.Message] = (
     control.PhaseChanged("running", is_paused=False),
     control.Ended(0, "done", {}, 1.0, None),
     control.Advance(3, 1, {"a.x": 2}, (("a", "y", b"12345678"),)),
-    control.Settled(3, {"a": 0.5}, {"a.x": (3, b"1234"), "a.z": (1, b"")}),
+    control.AtRest(3, {"a": 0.5}, {"a.x": (3, b"1234"), "a.z": (1, b"")}),
 )
 
 
 @target(lambda: [to_bytes(each) for each in SENT], change_bytes)
 def control_message(data: bytes, _: Path) -> None:
     for group in (control.FROM_NODES, control.TO_NODES, control.FROM_OBSERVERS,
-                  control.TO_OBSERVERS, control.FROM_SESSION):  # fmt: skip
+                  control.TO_OBSERVERS):  # fmt: skip
         decoder = decoder_of(tuple(group))
         with allowed(ControlError):
             message = to_bytes(decode(data, decoder, "a"))

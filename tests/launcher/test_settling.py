@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuros.control import AtRest, Message, Pause, Settle, Settled
+from neuros.control import Advance, AtRest, Message, Pause
 from neuros.control.link import ControlLink
 from neuros.launcher.channels import Channels, Settling
 
@@ -32,7 +32,7 @@ class World:
         self.sent: Counter[str] = Counter()
         self.received: Counter[str] = Counter()
         self.on_way: dict[str, deque[str]] = {f"{a} -> {b}": deque() for a, b in self.pairs()}
-        self.asked: dict[str, deque[Settle]] = {name: deque() for name in self.names}
+        self.asked: dict[str, deque[Advance]] = {name: deque() for name in self.names}
         self.answers: deque[AtRest] = deque()
         self.settled: list[Message] = []
         self.now_s = 0.0
@@ -46,7 +46,7 @@ class World:
         return any(self.work.values()) or any(self.on_way.values())
 
     def send(self, message: Message) -> None:
-        if isinstance(message, Settle):
+        if isinstance(message, Advance):
             for name in self.names:
                 self.asked[name].append(message)
         else:
@@ -90,7 +90,7 @@ class World:
         others = [way for way in self.on_way if way.split()[-1] == name]
         sent = {way: (self.sent[way], 0) for way in own}
         received = {way: (self.received[way], 0) for way in others}
-        self.answers.append(AtRest((name,), number, True, sent, received, {}, {}))
+        self.answers.append(AtRest(number, {}, {}, (name,), True, sent, received))
 
     def hear(self, _: str) -> None:
         self.settling.take(self.answers.popleft())
@@ -99,12 +99,12 @@ class World:
 @given(size=st.integers(2, 4), packets=st.integers(0, 30), seed=st.integers(0, 2**32))
 def test_it_is_told_when_nothing_moves_and_not_before(size: int, packets: int, seed: int) -> None:
     world = World(size, packets, random.Random(seed))
-    world.settling.ask(SESSION, Settle(7, {}))
+    world.settling.ask(SESSION, Advance(7, 0, {}))
     for _ in range(20_000):
         if world.settled:
             break
         world.turn()
-    assert world.settled == [Settled(7, {}, {})]
+    assert world.settled == [AtRest(7, {}, {})]
 
 
 class Asked:
@@ -112,11 +112,11 @@ class Asked:
 
     def __init__(self) -> None:
         self.greeted = {"a", "b"}
-        self.rounds: list[Settle] = []
+        self.rounds: list[Advance] = []
         self.told: list[Message] = []
 
     def send(self, message: Message) -> None:
-        if isinstance(message, Settle):
+        if isinstance(message, Advance):
             self.rounds.append(message)
 
     def send_to(self, _: ControlLink, message: Message) -> None:
@@ -130,21 +130,21 @@ def asked() -> Asked:
 
 def test_one_process_is_asked_once(asked: Asked) -> None:
     settling = Settling(["a", "b"], cast(Channels, asked))
-    settling.ask(SESSION, Settle(1, {"a.x": 3}))
-    assert asked.rounds == [Settle(1, {"a.x": 3})]
+    settling.ask(SESSION, Advance(1, 0, {"a.x": 3}))
+    assert asked.rounds == [Advance(1, 0, {"a.x": 3})]
     newest = {"a.x": (4, b"")}
-    settling.take(AtRest(("a", "b"), 1, True, {}, {}, {"a": 0.5}, newest))
-    assert asked.told == [Settled(1, {"a": 0.5}, newest)]
+    settling.take(AtRest(1, {"a": 0.5}, newest, ("a", "b")))
+    assert asked.told == [AtRest(1, {"a": 0.5}, newest)]
 
 
 def test_packets_of_a_lossy_connection_are_given_up_after_a_while(asked: Asked) -> None:
     now_s = 0.0
     settling = Settling(["a", "b"], cast(Channels, asked), lambda: now_s)
-    settling.ask(SESSION, Settle(1, {}))
+    settling.ask(SESSION, Advance(1, 0, {}))
     while not asked.told:
         number = asked.rounds[-1].number
-        settling.take(AtRest(("a",), number, True, {"a.x -> b.y": (3, -1)}, {}, {}, {}))
-        settling.take(AtRest(("b",), number, True, {}, {"a.x -> b.y": (2, -1)}, {}, {}))
+        settling.take(AtRest(number, {}, {}, ("a",), True, {"a.x -> b.y": (3, -1)}, {}))
+        settling.take(AtRest(number, {}, {}, ("b",), True, {}, {"a.x -> b.y": (2, -1)}))
         now_s += 0.01
         settling.look()
     assert 0.1 <= now_s < 0.2
@@ -154,31 +154,31 @@ def test_nodes_that_have_not_begun_are_waited_for(asked: Asked) -> None:
     now_s = 0.0
     settling = Settling(["a", "b"], cast(Channels, asked), lambda: now_s)
     asked.greeted = {"a"}
-    settling.ask(SESSION, Settle(1, {}))
+    settling.ask(SESSION, Advance(1, 0, {}))
     assert not asked.rounds
     asked.greeted = {"a", "b"}
     now_s += 1.0
     settling.look()
-    settling.take(AtRest(("a", "b"), asked.rounds[-1].number, False, {}, {}, {}, {}))
+    settling.take(AtRest(asked.rounds[-1].number, {}, {}, ("a", "b"), False, {}, {}))
     assert not asked.told
     now_s += settling.wait_s + 1.0
     settling.look()
-    settling.take(AtRest(("a", "b"), asked.rounds[-1].number, True, {}, {}, {}, {}))
+    settling.take(AtRest(asked.rounds[-1].number, {}, {}, ("a", "b"), True, {}, {}))
     assert asked.told
 
 
 def test_who_lets_the_run_go_on_is_answered_no_more_and_holds_it_no_more(asked: Asked) -> None:
     now_s = 0.0
     settling = Settling(["a"], cast(Channels, asked), lambda: now_s)
-    settling.ask(SESSION, Settle(1, {}))
-    not_begun = AtRest(("a",), asked.rounds[-1].number, False, {}, {}, {}, {})
+    settling.ask(SESSION, Advance(1, 0, {}))
+    not_begun = AtRest(asked.rounds[-1].number, {}, {}, ("a",), False, {}, {})
     settling.take(not_begun)
     settling.give_up(cast(ControlLink, object()))
     now_s += settling.wait_s + 1.0
     settling.look()
     assert len(asked.rounds) == 2
     settling.give_up(SESSION)
-    settling.take(AtRest(("a",), asked.rounds[-1].number, True, {}, {}, {}, {}))
+    settling.take(AtRest(asked.rounds[-1].number, {}, {}, ("a",), True, {}, {}))
     now_s += 1.0
     settling.look()
     assert len(asked.rounds) == 2

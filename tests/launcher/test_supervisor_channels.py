@@ -14,6 +14,7 @@ from neuros.backends.control_sockets import UnixListener, connect
 from neuros.control import (
     TO_NODES,
     TO_OBSERVERS,
+    AtRest,
     Deliver,
     End,
     Ended,
@@ -25,7 +26,6 @@ from neuros.control import (
     LookAll,
     Probe,
     Ready,
-    Settled,
     Stop,
     WasReset,
     Watch,
@@ -238,7 +238,7 @@ def test_an_observer_that_reads_late_misses_records_and_not_what_it_waits_for(
     ((link, _),) = channels.receive()
     for _ in range(300):
         channels.send_to(link, LogRecord("INFO", "x" * 10_000))
-    answers = [Settled(1, {}, {}), WasReset(""), Ended(0, "done", {}, 1.0, None, True)]
+    answers = [AtRest(1, {}, {}), WasReset(""), Ended(0, "done", {}, 1.0, None, True)]
     for answer in answers:
         channels.send_to(link, answer)
     got = received(channels, observer, until=answers[-1])
