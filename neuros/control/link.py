@@ -69,11 +69,6 @@ class ControlLink:
         """For selectors."""
         return self.stream.fileno()
 
-    @property
-    def unfinished_bytes(self) -> int:
-        """How much has arrived of a message whose end has not."""
-        return len(self._received)
-
     def send(self, message: Message) -> bool:
         """Send one message; returns False if the other end is gone."""
         try:
