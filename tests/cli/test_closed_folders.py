@@ -16,7 +16,7 @@ from typing import NamedTuple
 import pytest
 
 from neuros.cli.main import COMMANDS, parser
-from tests.ordinary_user import AS_ORDINARY_USER
+from tests.support.ordinary_user import AS_ORDINARY_USER
 
 EXAMPLE = Path(__file__).parents[2] / "examples/1_tick/clock"
 KEPT = Path(__file__).parents[1] / "upgrades/kept/2.0.0/run"

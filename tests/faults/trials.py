@@ -148,7 +148,7 @@ class Trial:
         program: Sequence[str] = LAUNCH,  # one that is forked does not have our mark for all to see
         **more: Any,
     ) -> Running:
-        """Start the run, recorded; ``more`` goes to :func:`tests.launching.start`."""
+        """Start the run, recorded; ``more`` goes to :func:`tests.support.launching.start`."""
         return start(
             self.folder / "project.json",
             *("--backend", backend, "--duration", f"{duration_s:g}"),

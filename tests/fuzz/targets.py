@@ -54,10 +54,10 @@ from neuros.transport.large_packets import LargeInput, LargeOutput
 from neuros.transport.message_buffers import message_buffers
 from neuros.transport.ros import data_qos, position_of
 from neuros.transport.ros_graph import qos_profile
-from tests.message_packages import MANIFEST
-from tests.message_values import message_classes
-from tests.run_folders import accounting, run_folder
+from tests.support.message_packages import MANIFEST
+from tests.support.message_values import message_classes
 from tests.support.recordings import NUMBER, number, plan, spool
+from tests.support.run_folders import accounting, run_folder
 
 from .mutation import Mutate, change_bytes, change_json, change_text, change_xml, mixed
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.launching import BACKENDS, Running, start
+from tests.support.launching import BACKENDS, Running, start
 
 DAEMON = """
 import os, sys

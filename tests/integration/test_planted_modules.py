@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from neuros.distribution import python_command
-from tests.launching import BACKENDS
+from tests.support.launching import BACKENDS
 
 NEUROS = Path(sys.executable).with_name("neuros")
 # Of NeuROS, of Python, and of others; each is imported by a process of a run, or to start one.

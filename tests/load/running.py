@@ -17,7 +17,7 @@ from typing import Any
 
 import psutil
 
-from tests.launching import LAUNCH, start
+from tests.support.launching import LAUNCH, start
 
 from .shapes import SHAPES, Shape
 

@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from tests.tables import update_rows
+from tests.support.tables import update_rows
 
 from .running import BACKENDS, STRICT, Repeated, changing_load, differing, repeat
 

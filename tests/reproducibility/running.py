@@ -14,8 +14,8 @@ from pathlib import Path
 
 from xxhash import xxh3_64_hexdigest
 
-from tests.launching import EXAMPLES, Finished, launch
 from tests.load.running import busy_processes
+from tests.support.launching import EXAMPLES, Finished, launch
 
 BACKENDS = ("in-process", "process", "docker")
 STRICT: dict[str, tuple[str, ...]] = {

@@ -8,7 +8,7 @@ import shutil
 from pathlib import Path
 
 from neuros.distribution import __version__
-from tests.launching import REPOSITORY, launch
+from tests.support.launching import REPOSITORY, launch
 
 HERE = Path(__file__).resolve().parent
 KEPT = HERE / "kept"

@@ -17,7 +17,7 @@ from cable import Cable  # noqa: E402
 from conditions import CONDITIONS, Stream, stream  # noqa: E402
 from two_machines import two_machines  # noqa: E402
 
-from tests.tables import update_rows  # noqa: E402
+from tests.support.tables import update_rows  # noqa: E402
 
 _IMAGE_BYTES = 1 << 16
 _HEAD = "| cable | bytes | arrived | took | median | p95 | max. |"

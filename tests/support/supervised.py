@@ -21,7 +21,7 @@ from neuros.launcher.supervisor import Supervisor
 from neuros.ports import ControlListener, NodeProgram
 from neuros.project.model import Connection, Folders, Node, NodeFile
 
-HOST = [sys.executable, "-S", str(Path(__file__).parent / "launcher" / "stand_in_host.py")]
+HOST = [sys.executable, "-S", str(Path(__file__).parents[1] / "launcher" / "stand_in_host.py")]
 WELL_BEHAVED = "host.up(); host.serve()"
 SHUTS_DOWN = "host.up(); host.tell('shutdown', reason='enough', drain_s=5); host.serve()"
 DEAF = "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); time.sleep(60)"

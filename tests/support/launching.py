@@ -29,9 +29,9 @@ from typing import IO, Any
 
 import pytest
 
-from tests.preloaded import PreloadedLauncher, may_fork
+from tests.support.preloaded import PreloadedLauncher, may_fork
 
-REPOSITORY = Path(__file__).resolve().parents[1]
+REPOSITORY = Path(__file__).resolve().parents[2]
 EXAMPLES = REPOSITORY / "examples"
 BACKENDS = ("process", "in-process")
 LAUNCH = (sys.executable, "-m", "neuros.cli", "launch")

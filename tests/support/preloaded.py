@@ -22,7 +22,7 @@ import pytest
 _FORKING = multiprocessing.get_context("forkserver")
 _FORKING.set_forkserver_preload(
     [
-        "tests.preloaded",
+        "tests.support.preloaded",
         "jsonschema",
         "numpy.ma",  # numpy.unique() imports it
         "msgspec",

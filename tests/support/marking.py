@@ -20,7 +20,7 @@ from zlib import crc32
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 HERE = tuple(f"{ROOT / name}{os.sep}" for name in ("tests", "extensions"))
 KINDS = ("ros", "docker", "browser", "process", "slow")
 # By module, or by name in a module.
@@ -211,7 +211,7 @@ class Watch:
         if self._noted:
             pytest.fail(
                 f"a unit test must not leave its process: {', '.join(self._noted)};"
-                " let tests/marking.py know",
+                " let tests/support/marking.py know",
                 pytrace=False,
             )
 
