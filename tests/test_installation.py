@@ -102,12 +102,15 @@ class TestExplanations:
 
     def test_a_package_that_the_index_has_not_for_this_processor_is_named(self) -> None:
         explanation = explain_failure(
-            "cause: Because ros-rclpy==7.1.6 has no wheels with a matching platform tag (e.g.,"
+            "No solution found\n  cause: Because ros-rclpy==7.1.6"
+            " has no wheels with a matching platform tag (e.g.,"
             " `manylinux_2_28_aarch64`) and you require ros-rclpy==7.1.6, we can conclude that your"
             " requirements are unsatisfiable."
         )
         assert explanation is not None
-        assert "no ros-rclpy for this processor (aarch64): use Docker, docker run" in explanation
+        assert "processor (ros-rclpy==7.1.6 has no wheels" in explanation
+        assert "`manylinux_2_28_aarch64`" in explanation
+        assert "): use Docker, docker run" in explanation
 
     def test_what_is_not_known_is_not_guessed(self) -> None:
         assert explain_failure("something new") is None

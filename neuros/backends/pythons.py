@@ -1,8 +1,8 @@
 """Python of each container, for nodes that run as processes.
 
-A node whose container has a ``requirements.txt`` that this environment satisfies runs on this
-Python. Every other container gets a virtual environment of its own, made before anything starts
-(:mod:`neuros.backends.virtual_environments`). What is chosen here changes nothing.
+A node runs on this Python if this environment satisfies the ``requirements.txt`` of its container.
+Every other container gets a virtual environment, made before anything starts
+(:mod:`neuros.backends.virtual_environments`). Choosing changes nothing on the disk.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ FILE = ".python-version"
 _VERSION = re.compile(r"(?:c?python-?)?(\d+)\.(\d+)(?:\.\d+)*")
 _ASK = "import sys; print(sys.implementation.name, *sys.version_info[:2])"
 _ANSWER_TIMEOUT_S = 10.0
-_FORMAT = 2  # of what is made: another one makes all environments anew
+_FORMAT = 2  # of environments: another number makes all anew
 
 
 def wanted_version(folder: Path) -> Version | None:
@@ -72,29 +72,22 @@ def wanted_version(folder: Path) -> Version | None:
 
 def find_python(version: Version, environ: Mapping[str, str]) -> Path | None:
     """A CPython of that version on this machine that runs, or ``None``."""
-    for path in _candidates(f"python{dotted(version)}", environ):
-        if os.access(path, os.X_OK) and _is_version(path, version, environ):
-            return path
-    return None
-
-
-def _candidates(name: str, environ: Mapping[str, str]) -> Iterator[Path]:
-    for folder in environ.get("PATH", os.defpath).split(os.pathsep):
-        if folder:
-            yield Path(folder) / name
-    # A shim of pyenv is on the path, and refuses what its settings do not name.
+    name = f"python{dotted(version)}"
+    folders = environ.get("PATH", os.defpath).split(os.pathsep)
+    candidates = [Path(folder) / name for folder in folders if folder]
+    # A shim of pyenv on the path refuses versions that pyenv's settings do not name.
     home = Path(environ.get("HOME") or "/")
     pyenv = Path(environ.get("PYENV_ROOT") or home / ".pyenv") / "versions"
     data = Path(environ.get("XDG_DATA_HOME") or home / ".local/share")
     uv = Path(environ.get("UV_PYTHON_INSTALL_DIR") or data / "uv/python")
     for installations in (pyenv, uv):
-        yield from sorted(installations.glob(f"*/bin/{name}"), reverse=True)
-
-
-def _is_version(path: Path, version: Version, environ: Mapping[str, str]) -> bool:
-    command = [str(path), "-I", "-S", "-c", _ASK]
-    answer = answer_of(command, clean_environment(environ), _ANSWER_TIMEOUT_S)
-    return answer is not None and answer.stdout.split() == ["cpython", *map(str, version)]
+        candidates += sorted(installations.glob(f"*/bin/{name}"), reverse=True)
+    for path in candidates:
+        command = [str(path), "-I", "-S", "-c", _ASK]
+        answer = answer_of(command, clean_environment(environ), _ANSWER_TIMEOUT_S)
+        if answer and answer.stdout.split() == ["cpython", *map(str, version)]:
+            return path
+    return None
 
 
 def choose(container: ContainerFolder, cache: Path, environ: Mapping[str, str]) -> Choice:
@@ -129,8 +122,8 @@ def choose_here(container: ContainerFolder, cache: Path) -> Choice:
     entry = _entry(container, requirements, cache, HERE)
     if entry.python():
         return Choice(container, requirements, HERE, entry)
-    # The files of NeuROS's own containers say with exact versions what goes into images; which
-    # versions are here is up to what has installed NeuROS.
+    # NeuROS's own containers name exact versions for their images; the versions here are those
+    # of the installation.
     lacks = tuple(unmet(requirements, any_version=container.is_own))
     base = Path(getattr(sys, "_base_executable", sys.executable)) if lacks else None
     return Choice(container, requirements, HERE, entry, lacks, base)
@@ -139,27 +132,21 @@ def choose_here(container: ContainerFolder, cache: Path) -> Choice:
 def _entry(
     container: ContainerFolder, requirements: Requirements, cache: Path, version: Version
 ) -> Entry:
-    here = _installed_here()
-    what = [_FORMAT, container.is_own, requirements.digest, version, str(PACKAGE), own_needs()]
-    what += [name for name in here if os.path.basename(name).startswith("neuros_")]  # extensions
-    if version == HERE:
-        what += [sys.executable, sys.version, here]
-    key = hashlib.sha256(json.dumps(what).encode()).hexdigest()
-    return Entry(cache / f"{container.name}-{key[:KEY_LENGTH]}")
-
-
-def _installed_here() -> list[str]:
-    """Names and versions of what is installed, from the names of folders only: it has to be quick.
-
-    An environment on top of this one is no longer the same when anything here changes.
-    """
-    return [
+    # An environment on top of this one is no longer the same when a package here changes. Names of
+    # folders hold names and versions, and are quick to list.
+    here = [
         f"{folder}/{name}"
         for folder in packages_here()
         if folder.is_dir()
         for name in sorted(os.listdir(folder))
         if name.endswith((".dist-info", ".egg-info"))
     ]
+    parts = [_FORMAT, container.is_own, requirements.digest, version, str(PACKAGE), own_needs()]
+    parts += [name for name in here if os.path.basename(name).startswith("neuros_")]  # extensions
+    if version == HERE:
+        parts += [sys.executable, sys.version, here]
+    key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+    return Entry(cache / f"{container.name}-{key[:KEY_LENGTH]}")
 
 
 class Pythons:
@@ -174,10 +161,10 @@ class Pythons:
 
     @classmethod
     def choose(cls, nodes: Sequence[Node], project: Path, environ: Mapping[str, str]) -> Pythons:
-        """Decide for the nodes of a project in the folder ``project``; changes nothing.
+        """Choose for the nodes of the project in the folder ``project``.
 
         Raises:
-            EnvironmentFault: with all that is wrong in the folders of containers.
+            EnvironmentFault: with all mistakes in the folders of containers.
         """
         cache, faults = cache_folder(environ), []
         choices: dict[str, Choice] = {}
@@ -192,7 +179,7 @@ class Pythons:
 
     @property
     def paths(self) -> Mapping[str, Path]:
-        """The Python of each node that does not run on this very one."""
+        """The Python of each node that does not run on this Python."""
         pythons = {name: choice.path for name, choice in self._choices.items()}
         return {name: path for name, path in pythons.items() if path != Path(sys.executable)}
 
@@ -203,17 +190,17 @@ class Pythons:
 
     @property
     def is_made(self) -> bool:
-        """Whether everything is there."""
+        """Whether all environments exist."""
         return not any(choice.base for choice in self._each())
 
     def note_use(self) -> None:
-        """Remember what was found out, as far as the cache can be written to."""
+        """Record the use of each choice, where the cache can be written."""
         for choice in self._each():
             with contextlib.suppress(OSError):
                 choice.settle()
 
     def make(self, progress: Progress, run_environment: Mapping[str, str]) -> None:
-        """Make what is missing; ``run_environment`` is added to that of the programs it starts.
+        """Make missing environments; ``run_environment`` is added to that of pip, uv and venv.
 
         Raises:
             EnvironmentFault: with a sentence for each container for which that failed.
@@ -245,10 +232,10 @@ class Pythons:
 
 
 def require_one_python(nodes: Sequence[Node], project: Path, environ: Mapping[str, str]) -> None:
-    """Check that this very Python does for all nodes, as it must where they share a process.
+    """Check that this Python satisfies all nodes, which share one process.
 
     Raises:
-        EnvironmentFault: with what is missing, and the ways out.
+        EnvironmentFault: with the missing packages, and the remedies.
     """
     problems = []
     for container, names in _containers(nodes, project):

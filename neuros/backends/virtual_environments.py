@@ -1,21 +1,21 @@
-"""Virtual environments of containers: what goes into them, how they are made and kept.
+"""Virtual environments of containers.
 
-On the launcher's own version of Python an environment is a layer: its site-packages have what the
-container asks for and this environment has not, and everything else is found in this environment.
-On another version of Python it has everything, ROS 2 included.
+On the launcher's own version of Python an environment is a layer: its site-packages hold what the
+container asks for and the launcher's environment lacks; all else is found in the launcher's.
+On another version of Python it holds everything, ROS 2 included.
 
 ::
 
     ~/.cache/neuros/environments/     (or $XDG_CACHE_HOME/neuros/environments)
         <container>-<key>/            a virtual environment
-        <container>-<key>.here        the launcher's own environment does; there is no folder
-        <container>-<key>.lock        only while somebody makes it
-        <container>-<key>.log         what uv wrote
+        <container>-<key>.here        the launcher's own environment is enough; there is no folder
+        <container>-<key>.lock        exists while a launch makes the environment
+        <container>-<key>.log         output of uv
 
-A file ``neuros-whole`` comes last into an environment: what was interrupted never looks whole. A
-``.here`` saves the next start from reading the metadata of packages.
+The file ``neuros-whole`` is written last into an environment, so an interrupted one never looks
+whole. A ``.here`` saves the next start from reading the metadata of packages.
 
-``requirements.txt`` is read as pip reads it, and compared with what is installed here. The format:
+``requirements.txt`` is read as pip reads it, and compared with the installed packages. The format:
 https://pip.pypa.io/en/stable/reference/requirements-file-format/
 """
 
@@ -67,12 +67,12 @@ def cache_folder(environ: Mapping[str, str]) -> Path:
 
 @dataclass(frozen=True)
 class Entry(Kept):
-    """One environment, made or not; the log has what uv wrote."""
+    """One environment, made or not; its log is the output of uv."""
 
     @property
     def stamp(self) -> Path:
-        """An empty file: the environment is whole; without one, the launcher's own Python does."""
-        has_folder = os.path.exists(self.folder)  # not in a cache that may not be entered
+        """An empty file: the environment is whole, or the launcher's own Python is enough."""
+        has_folder = os.path.exists(self.folder)  # exists() raises in a cache without rights
         return self.folder / "neuros-whole" if has_folder else self.beside(".here")
 
     @property
@@ -81,39 +81,37 @@ class Entry(Kept):
         return self.folder / "bin" / "python"
 
     def python(self) -> Path | None:
-        """The Python to run, if that has been settled and is there."""
+        """The Python to run, or ``None`` without a stamp."""
         python = self.future_python if os.path.exists(self.folder) else Path(sys.executable)
         return python if os.path.exists(self.stamp) and os.access(python, os.X_OK) else None
 
     def settle(self) -> None:
-        """From now on it is what the stamp says, and in use. Raises ``OSError``."""
+        """Write the stamp, whose time is that of the last use. Raises ``OSError``."""
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         self.stamp.touch()
 
     def remove(self) -> None:
-        """Remove it, as far as that is possible; the log stays."""
+        """Remove what can be removed, but not the log."""
         with contextlib.suppress(OSError):
-            self.stamp.unlink(missing_ok=True)  # first: half of it must not count as whole
+            self.stamp.unlink(missing_ok=True)  # first: a part must not count as whole
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def sweep(cache: Path) -> None:
-    """Remove what was interrupted, and what no run has used for a month."""
+    """Remove environments that were interrupted or that no run has used for a month."""
     oldest_s = time.time() - UNUSED_S
     for entry in map(Entry, kept_in(cache)):
         with contextlib.suppress(OSError), entry.locked(wait=False) as is_mine:
-            if is_mine and _last_used_s(entry) < oldest_s:
+            if not is_mine:
+                continue
+            used_s = 0.0  # for a folder that is not whole
+            if entry.stamp.exists():
+                used_s = entry.stamp.stat().st_mtime
+            elif entry.log.exists() and not entry.folder.exists():
+                used_s = entry.log.stat().st_mtime
+            if used_s < oldest_s:
                 entry.remove()
                 entry.log.unlink(missing_ok=True)
-
-
-def _last_used_s(entry: Entry) -> float:
-    """When a run last used it; 0 for a folder that is not whole."""
-    try:
-        return entry.stamp.stat().st_mtime
-    except FileNotFoundError:
-        is_log_alone = not entry.folder.exists() and entry.log.exists()
-        return entry.log.stat().st_mtime if is_log_alone else 0.0
 
 
 @dataclass(frozen=True)
@@ -121,11 +119,11 @@ class Choice:
     """The Python and the packages of a container.
 
     Attributes:
-        version: the Python that it is to run on.
+        version: of its Python.
         entry: its place in the cache.
-        lacks: what this environment lacks, in words, as far as that had to be found out.
+        lacks: requirements that this environment lacks, in words; empty where nobody had to look.
         base: the interpreter to make its environment with; ``None`` if nothing is to be made.
-        notice: what the user should know, or empty.
+        notice: for the user, or empty.
     """
 
     container: ContainerFolder
@@ -138,18 +136,18 @@ class Choice:
 
     @property
     def is_layered(self) -> bool:
-        """Whether its environment lies on top of this one, and has only what differs."""
+        """Whether its environment is a layer over this one."""
         return self.version == HERE
 
     @property
     def path(self) -> Path:
-        """Its Python, which may have to be made first."""
+        """Its Python, which may not be made yet."""
         if self.base is not None:
             return self.entry.future_python
         return self.entry.python() or Path(sys.executable)
 
     def settle(self) -> None:
-        """Remember for later starts that it is in use, or that this very Python does.
+        """Record for later starts that the environment, or this very Python, is used.
 
         Raises ``OSError``.
         """
@@ -158,7 +156,7 @@ class Choice:
 
 
 def own_needs() -> list[str]:
-    """The requirements of NeuROS itself; empty if it is not installed here."""
+    """The requirements of NeuROS itself; empty if NeuROS is not installed here."""
     try:
         needs = importlib.metadata.requires("neuros") or []
     except importlib.metadata.PackageNotFoundError:
@@ -167,7 +165,7 @@ def own_needs() -> list[str]:
 
 
 def packages_here() -> list[Path]:
-    """The folders of this Python with installed packages, those that are found first first."""
+    """The folders of this Python with installed packages, in the order of ``sys.path``."""
     return [Path(p) for p in sys.path if Path(p).name in ("site-packages", "dist-packages")]
 
 
@@ -175,10 +173,10 @@ def make(choice: Choice, progress: Progress, run_environment: Mapping[str, str])
     """Make the environment, unless another launch has made it meanwhile.
 
     Args:
-        run_environment: is added to the environment of the programs that this starts.
+        run_environment: is added to the environment of pip, uv and venv.
 
     Raises:
-        EnvironmentFault: with a sentence for the user; then nothing of it is left but the log.
+        EnvironmentFault: with a sentence for the user; then only the log is left.
     """
     try:
         choice.entry.folder.parent.mkdir(parents=True, exist_ok=True)
@@ -193,13 +191,26 @@ def make(choice: Choice, progress: Progress, run_environment: Mapping[str, str])
 
 
 def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    """Make it, under the lock."""
+    """Make the environment while its lock is held."""
     entry = choice.entry
     if entry.python():
         return
-    entry.remove()  # what an interrupted run has left
+    entry.remove()  # an interrupted launch may have left a part
+    because = f" ({', '.join(choice.lacks)})" if choice.lacks else ""
+    progress.step(f"making {_words(choice)}{because}: {entry.folder}")
+    free_bytes = shutil.disk_usage(entry.folder.parent).free
+    if not choice.is_layered and free_bytes < _FULL_BYTES:
+        raise _fault(
+            choice,
+            f"{entry.folder.parent} has {free_bytes / 1e9:.1f} GB free and a whole environment"
+            f" needs {_FULL_BYTES / 1e9:.1f} GB: make room (df -h), or set XDG_CACHE_HOME",
+        )
+    # A layer finds the pip of the launcher's environment.
+    options = ["--without-pip"] if choice.is_layered and _is_here("pip") else []
+    command = python_command("venv", *options, str(entry.folder), python=choice.base)
     try:
-        _make_venv(choice, progress, run_environment)
+        if why := make_venv(command, {**os.environ, **run_environment}):
+            raise _fault(choice, why)
         _add_links(choice)
         _install(choice, progress, run_environment)
         entry.settle()
@@ -208,49 +219,27 @@ def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]
         raise
 
 
-def _make_venv(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    folder, because = choice.entry.folder, f" ({', '.join(choice.lacks)})" if choice.lacks else ""
-    progress.step(f"making {_words(choice)}{because}: {folder}")
-    free_bytes = shutil.disk_usage(folder.parent).free
-    if not choice.is_layered and free_bytes < _FULL_BYTES:
-        raise _fault(
-            choice,
-            f"{folder.parent} has {free_bytes / 1e9:.1f} GB free and a whole environment needs"
-            f" {_FULL_BYTES / 1e9:.1f} GB: make room (df -h), or set XDG_CACHE_HOME",
-        )
-    # A layer finds pip where it finds the rest.
-    options = ["--without-pip"] if choice.is_layered and _is_here("pip") else []
-    command = python_command("venv", *options, str(folder), python=choice.base)
-    if why := make_venv(command, {**os.environ, **run_environment}):
-        raise _fault(choice, why)
-
-
 def _add_links(choice: Choice) -> None:
-    """Give it this NeuROS with its extensions, and, if it is a layer, what is here."""
+    """Link NeuROS and its extensions, and for a layer the packages of this environment."""
     folder = choice.entry.folder
     site_packages = folder / "lib" / f"python{dotted(choice.version)}" / "site-packages"
     for name, place in libraries().items():
         (site_packages / name).symlink_to(place, target_is_directory=True)
-    if choice.is_layered:
-        rows = [str(path) for path in packages_here()]
-        if _is_here(_BOOTSTRAPPER):
-            _link_libraries(folder, site_packages)
-            rows.append(f"import {_BOOTSTRAPPER}")
-        # Lines of a .pth file come behind what is in the environment itself.
-        layer = "".join(f"{row}\n" for row in rows)
-        (site_packages / "neuros_layer.pth").write_text(layer, "utf-8")
-
-
-def _link_libraries(folder: Path, site_packages: Path) -> None:
-    """The wheels of ROS 2 look for their libraries and files below the prefix of their Python."""
-    prefix = Path(sys.prefix)
-    libraries = [path for path in (prefix / "lib").iterdir() if not path.name.startswith("python")]
-    for path in (*libraries, prefix / "share"):
-        link = folder / path.relative_to(prefix)
-        if path.exists() and not link.exists():
-            link.symlink_to(path)
-    for path in (path for here in packages_here() for path in here.glob("ros_*.libs")):
-        (site_packages / path.name).symlink_to(path)
+    if not choice.is_layered:
+        return
+    rows = [str(path) for path in packages_here()]
+    if _is_here(_BOOTSTRAPPER):
+        rows.append(f"import {_BOOTSTRAPPER}")
+        # The wheels of ROS 2 look for their libraries and files below the prefix of their Python.
+        prefix = Path(sys.prefix)
+        for path in (*(prefix / "lib").iterdir(), prefix / "share"):
+            link = folder / path.relative_to(prefix)
+            if not path.name.startswith("python") and path.exists() and not link.exists():
+                link.symlink_to(path)
+        for path in (path for here in packages_here() for path in here.glob("ros_*.libs")):
+            (site_packages / path.name).symlink_to(path)
+    # Python searches lines of a .pth file after the environment's own packages.
+    (site_packages / "neuros_layer.pth").write_text("".join(f"{row}\n" for row in rows), "utf-8")
 
 
 def _is_here(package: str) -> bool:
@@ -269,12 +258,12 @@ def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, s
     wanted = ["--requirement", str(file)]
     try:
         if choice.requirements.has_hashes:
-            # uv refuses what has no hash: what NeuROS needs comes first, by itself.
+            # uv refuses requirements without a hash, so those of NeuROS are installed first.
             if not choice.is_layered:
                 installer.install(needs)
             wanted, needs = ["--require-hashes", *wanted], []
         elif choice.is_layered:
-            # uv sees no packages of this environment in the layer: it plans for this environment.
+            # uv does not see this environment through the layer, so it plans for this environment.
             plan = ["--dry-run", "--break-system-packages", *wanted, *needs]
             planned = _PLANNED.findall(installer.install(plan, Path(sys.executable)))
             wanted, needs = ["--no-deps", *planned, *choice.requirements.editable], []
@@ -297,14 +286,17 @@ def _fault(choice: Choice, cause: str) -> EnvironmentFault:
 
 
 def why_uv_failed(output: str, python: str, own_needs: Sequence[str]) -> str:
-    """The cause in the output of uv, for a version of Python as ``3.12``.
+    """The cause in the output of uv.
 
-    ``own_needs`` are the requirements of NeuROS itself that uv was given, too.
+    Args:
+        python: the version, as ``3.12``.
+        own_needs: requirements of NeuROS itself among those that uv got.
     """
     if sentence := explain_machine(output, again="launch"):
         return sentence
     if cause := why_unsatisfiable(output):
-        own = [need for need in own_needs if re.search(rf"\b{_name_of(need)}\b", cause)]
+        names = {need: re.split(r"[^\w.-]", need)[0] for need in own_needs}
+        own = [need for need in own_needs if re.search(rf"\b{re.escape(names[need])}\b", cause)]
         return f"{cause} (for Python {python})" + "".join(f"; NeuROS needs {n}" for n in own)
     errors = re.findall(r"^(?:error|  cause): (.+)", output, re.MULTILINE)
     return ": ".join(errors) or "uv failed"
@@ -315,11 +307,6 @@ def why_no_files(error: OSError, cache: Path) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return f"the disk of {cache} is full: make room (df -h), or set XDG_CACHE_HOME"
     return f"{error.filename or cache}: {error.strerror}: set XDG_CACHE_HOME to another folder"
-
-
-def _name_of(requirement: str) -> str:
-    match = re.match(r"[\w.-]+", requirement)
-    return re.escape(match[0]) if match else ""
 
 
 _COMMENT = re.compile(r"(^|\s+)#.*$")
@@ -333,7 +320,7 @@ class Line:
     """One requirement, or an option of pip.
 
     Attributes:
-        is_constraint: whether it applies only if something else asks for the package.
+        is_constraint: whether it counts only if something else asks for the package.
     """
 
     text: str
@@ -342,10 +329,10 @@ class Line:
 
 @dataclass(frozen=True)
 class Requirements:
-    """A ``requirements.txt`` with all files that it includes.
+    """A ``requirements.txt`` with all included files.
 
     Attributes:
-        digest: changes with the content of any of them.
+        digest: of the contents of all.
     """
 
     file: Path
@@ -359,16 +346,16 @@ class Requirements:
 
     @property
     def editable(self) -> list[str]:
-        """The arguments that install what is to stay editable."""
+        """The arguments that install the editable requirements."""
         rows = [_EDITABLE.fullmatch(line.text) for line in self.lines]
         return [argument for row in rows if row for argument in ("--editable", row[1])]
 
 
 def read_requirements(file: Path) -> Requirements:
-    """Read a file and what it includes.
+    """Read a file and the files that it includes.
 
     Raises:
-        EnvironmentFault: if one of them cannot be read.
+        EnvironmentFault: if a file cannot be read.
     """
     digest = hashlib.sha256()
     lines: list[Line] = []
@@ -378,10 +365,19 @@ def read_requirements(file: Path) -> Requirements:
         if (path.resolve(), is_constraint) in seen:
             return
         seen.add((path.resolve(), is_constraint))
-        text = _text(path)
+        try:
+            text = path.read_text("utf-8-sig")
+        except OSError as error:
+            raise EnvironmentFault(f"{path} cannot be read: {error.strerror}") from error
+        except UnicodeDecodeError as error:
+            raise EnvironmentFault(f"{path} is not valid UTF-8: save it as UTF-8") from error
         digest.update(f"{is_constraint} {len(text)} {text}".encode())
-        for row in _rows(text):
+        # A backslash at the end joins a line to the next.
+        for line in re.sub(r"\\\r?\n", "", text).splitlines():
+            row = _COMMENT.sub("", line).strip()
             include = _INCLUDE.fullmatch(row)
+            if not row:
+                continue
             if include and "://" not in include["file"]:
                 read(path.parent / include["file"], is_constraint or "c" in include[1])
             else:
@@ -391,45 +387,23 @@ def read_requirements(file: Path) -> Requirements:
     return Requirements(file, tuple(lines), digest.hexdigest())
 
 
-def _text(file: Path) -> str:
-    try:
-        return file.read_text("utf-8-sig")
-    except OSError as error:
-        raise EnvironmentFault(f"{file} cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise EnvironmentFault(f"{file} is not valid UTF-8: save it as UTF-8") from error
-
-
-def _rows(text: str) -> Iterator[str]:
-    """Lines without comments; a backslash at the end joins a line to the next."""
-    for row in re.sub(r"\\\r?\n", "", text).splitlines():
-        stripped = _COMMENT.sub("", row).strip()
-        if stripped:
-            yield stripped
-
-
 def unmet(requirements: Requirements, *, any_version: bool = False) -> list[str]:
     """Requirements that this environment lacks, in words; empty if it lacks none.
 
     Args:
-        any_version: whether it is enough that a package is there.
+        any_version: whether any installed version of a package is enough.
     """
-    found = [
-        lack
-        for line in requirements.lines
-        if not line.text.startswith("-") or line.text.startswith(("-e", "--editable"))
-        for lack in _lacks(line, any_version)
-    ]
-    return list(dict.fromkeys(found))
+    options = ("-e", "--editable")
+    lines = [x for x in requirements.lines if x.text[:1] != "-" or x.text.startswith(options)]
+    return list(dict.fromkeys(lack for line in lines for lack in _lacks(line, any_version)))
 
 
 def _lacks(line: Line, any_version: bool) -> Iterator[str]:
     from packaging.requirements import InvalidRequirement, Requirement
 
-    text = _OPTION.sub("", line.text)
     try:
-        requirement = Requirement(text)
-    except InvalidRequirement:  # a path, an address, or a mistake: pip knows
+        requirement = Requirement(_OPTION.sub("", line.text))
+    except InvalidRequirement:  # a path, an address, or a mistake: uv tells
         yield line.text
         return
     pending, seen = [(requirement, "")], {""}
@@ -437,13 +411,18 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
         wanted, extra = pending.pop()
         if wanted.marker is not None and not wanted.marker.evaluate({"extra": extra}):
             continue
-        installed = _installed(wanted.name)
-        if installed is None:
+        text = str(wanted).partition(";")[0].strip()
+        try:
+            installed = importlib.metadata.distribution(wanted.name)
+            version = installed.version
+        except (importlib.metadata.PackageNotFoundError, FileNotFoundError, KeyError):
+            version = ""
+        if not version:  # or an interrupted pip has left a part of the package
             if not line.is_constraint:
-                yield f"{_without_marker(wanted)} (not installed)"
+                yield f"{text} (not installed)"
             continue
         if not (any_version or _fits(wanted, installed)):
-            yield f"{_without_marker(wanted)} ({installed.version} is installed)"
+            yield f"{text} ({version} is installed)"
             continue
         # What an extra adds is a requirement, too; other dependencies came with the package.
         for name in wanted.extras - seen:
@@ -452,21 +431,8 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
             pending += [(need, name) for need in needs]
 
 
-def _installed(name: str) -> importlib.metadata.Distribution | None:
-    """A package of this environment; ``None`` also for what an interrupted pip has left of one."""
-    try:
-        found = importlib.metadata.distribution(name)
-        return found if found.version else None
-    except (importlib.metadata.PackageNotFoundError, FileNotFoundError, KeyError):
-        return None
-
-
 def _fits(wanted: Requirement, installed: importlib.metadata.Distribution) -> bool:
     if wanted.url:
         origin = installed.read_text("direct_url.json")
         return origin is not None and json.loads(origin).get("url") == wanted.url
     return wanted.specifier.contains(installed.version, prereleases=True)
-
-
-def _without_marker(wanted: Requirement) -> str:
-    return str(wanted).partition(";")[0].strip()

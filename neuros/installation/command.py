@@ -10,7 +10,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
@@ -80,13 +79,18 @@ def main(arguments: Sequence[str], root: str) -> int:
     except KeyboardInterrupt:
         progress.fail("install.py: interrupted; run it again to go on")
         return 130
-    for row in _next_steps(folder, environment.extras):
-        progress.step(row)
+    if not offscreen_opengl():
+        progress.step(f"simulated cameras need a graphics library: {install_opengl()}")
+    has_nest = "nest" in environment.extras
+    example = "4_neurorobotics/whiskeye" if has_nest else "3_physics_simulation/elevator"
+    is_here = Path.cwd() == folder
+    launch = "./launch.py examples" if is_here else f"{folder / 'launch.py'} {folder / 'examples'}"
+    progress.step(f"installed; the next command: {launch}/{example}")
     return 0
 
 
 def parse_options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Namespace:
-    """What the command line of ``install.py`` says; ``known`` are the extras that there are.
+    """Parse the command line of ``install.py``; ``known`` are the extras of the project.
 
     Raises:
         SystemExit: from argparse, with 2 for wrong arguments and 0 for ``--help``.
@@ -118,22 +122,6 @@ def parse_options(arguments: Sequence[str], known: Sequence[str]) -> argparse.Na
         action="store_true",
         help="then run all checks and tests; root first installs the Debian packages for them",
     )
-    _add_container_options(parser)
-    options = parser.parse_args(arguments)
-    extras = {*STANDARD_EXTRAS, *(name for name in options.extras.split(",") if name)}
-    extras.update(DEVELOPER_EXTRAS if options.dev or options.test else ())
-    extras.update(("docs",) if options.docs else ())
-    if unknown := sorted(extras - set(known)):
-        parser.error(f"no such extra: {', '.join(unknown)} (there are {', '.join(known)})")
-    options.extras = sorted(extras)
-    if options.wheelhouse and not Path(options.wheelhouse).is_dir():
-        parser.error(f"--wheelhouse {options.wheelhouse}: there is no such folder")
-    if options.ca_bundle and not Path(options.ca_bundle).is_file():
-        parser.error(f"--ca-bundle {options.ca_bundle}: there is no such file")
-    return options
-
-
-def _add_container_options(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group(
         "containers", "If there is a Docker engine, the images that nodes run in are built, too."
     )
@@ -150,6 +138,18 @@ def _add_container_options(parser: argparse.ArgumentParser) -> None:
         "where PyPI cannot be reached as usual", "These are for containers, too."
     )
     add_build_options(group, offline)
+    options = parser.parse_args(arguments)
+    extras = {*STANDARD_EXTRAS, *(name for name in options.extras.split(",") if name)}
+    extras.update(DEVELOPER_EXTRAS if options.dev or options.test else ())
+    extras.update(("docs",) if options.docs else ())
+    if unknown := sorted(extras - set(known)):
+        parser.error(f"no such extra: {', '.join(unknown)} (there are {', '.join(known)})")
+    options.extras = sorted(extras)
+    if options.wheelhouse and not Path(options.wheelhouse).is_dir():
+        parser.error(f"--wheelhouse {options.wheelhouse}: there is no such folder")
+    if options.ca_bundle and not Path(options.ca_bundle).is_file():
+        parser.error(f"--ca-bundle {options.ca_bundle}: there is no such file")
+    return options
 
 
 def add_build_options(
@@ -176,7 +176,7 @@ def add_build_options(
 
 
 def prepare_tests(root: Path) -> None:
-    """Install what the tests need of the operating system; who is not root, reads what it is."""
+    """Install the system packages for the tests; without the rights of root, print their names."""
     subprocess.call([sys.executable, str(root / "tests" / "needs.py"), "--install"])
 
 
@@ -188,21 +188,10 @@ def _agrees(folder: Path) -> bool:
     return answer.strip().lower() in ("", "y", "yes")
 
 
-def _next_steps(root: Path, extras: Sequence[str]) -> list[str]:
-    rows = []
-    if not offscreen_opengl():
-        rows.append(f"simulated cameras need a graphics library: {install_opengl()}")
-    example = "4_neurorobotics/whiskeye" if "nest" in extras else "3_physics_simulation/elevator"
-    is_here = Path.cwd() == root
-    launch = "./launch.py examples" if is_here else f"{root / 'launch.py'} {root / 'examples'}"
-    return [*rows, f"installed; the next command: {launch}/{example}"]
-
-
 def build_containers(python: Path, options: argparse.Namespace) -> int:
-    """Build what is missing or out of date; returns an exit code.
+    """Build images that are missing or out of date; returns an exit code.
 
-    Where nothing was asked for by name, a machine without Docker gets a line about it, and that is
-    all.
+    Without Docker and without a container named by the user, this only prints a line.
     """
     command = python_command("neuros.cli", *build_arguments(options), python=python)
     return subprocess.call(command, env=clean_environment(os.environ))
@@ -211,7 +200,7 @@ def build_containers(python: Path, options: argparse.Namespace) -> int:
 def build_messages(python: Path, root: Path) -> int:
     """Build the message packages of NeuROS's workspace; returns an exit code.
 
-    A machine without a C compiler gets a line about it, and that is all.
+    Without a C compiler this only prints a line.
     """
     command = python_command("neuros.cli", "build", "--if-compiler", python=python)
     return subprocess.call(command, cwd=root, env=clean_environment(os.environ))
@@ -230,36 +219,19 @@ def build_arguments(options: argparse.Namespace) -> Sequence[str]:
 
 
 def build_documentation(python: Path, root: Path) -> int:
-    """Build ``docs/build/html``; returns an exit code. What is wrong is said by Sphinx."""
+    """Build ``docs/build/html``; returns an exit code. Sphinx prints the errors."""
     command = [str(python), str(root / "docs" / "make.py")]
     return subprocess.call(command, env=clean_environment(os.environ))
 
 
-@dataclass(frozen=True)
-class _Proof:
-    """Code that only runs where a part is really installed, and whose version is shown."""
-
-    name: str
-    distribution: str
-    code: str
-
-
-_ROS = _Proof(
-    "ROS 2",
-    "ros-jazzy-rclpy",
-    "import jsonschema, rclpy, sensor_msgs.msg\n"
-    "rclpy.utilities.get_rmw_implementation_identifier()",
-)
+# Parts with libraries of their own, and code that runs only where these load.
 _PROOFS = {
-    "mujoco": _Proof(
-        "MuJoCo", "mujoco", "import mujoco; mujoco.MjModel.from_xml_string('<mujoco/>')"
+    "ROS 2": (
+        "import jsonschema, rclpy, sensor_msgs.msg;"
+        " rclpy.utilities.get_rmw_implementation_identifier()"
     ),
-    "nest": _Proof("NEST", "nest-simulator", "import nest; nest.Create('iaf_psc_alpha')"),
-    "plot": _Proof("Matplotlib", "matplotlib", "import matplotlib.figure"),
-    "tensorflow": _Proof("TensorFlow", "tensorflow-cpu", "import tensorflow"),
-    "docs": _Proof("Sphinx", "sphinx", "import sphinx, furo, myst_parser, sphinx_copybutton"),
-    "benchmark": _Proof("psutil", "psutil", "import psutil"),
-    "dev": _Proof("pytest", "pytest", "import pytest, xdist, hypothesis, mypy, psutil"),
+    "MuJoCo": "import mujoco; mujoco.MjModel.from_xml_string('<mujoco/>')",
+    "NEST": "import nest; nest.Create('iaf_psc_alpha')",
 }
 
 
@@ -275,13 +247,16 @@ def extras_of(pyproject: str) -> tuple[str, ...]:
 
 
 class Environment:
-    """The virtual environment of a source tree, and what it should hold.
+    """The virtual environment of a source tree.
+
+    Args:
+        extras: to install beside the core.
+        pip_settings: are added to the environment of pip.
+        newest: whether versions are the newest, not those of the lock files.
 
     Attributes:
         folder: ``.venv`` in the source tree.
-        extras: what is installed beside the core; NEST is left out where there is none.
-
-    ``pip_settings`` are added to the environment of pip; ``newest`` does without lock files.
+        extras: without NEST where NEST has no packages for this Python.
     """
 
     def __init__(
@@ -296,7 +271,7 @@ class Environment:
         self.folder, self.extras = root / ".venv", tuple(extras)
         self._root, self._progress = root, progress
         self._pip_settings, self._newest = pip_settings, newest
-        # There while something is installed: half a package would be taken for whole.
+        # Exists during an installation: an interrupted one leaves packages that only look whole.
         self._unfinished = self.folder / "neuros-unfinished"
 
     @property
@@ -305,7 +280,7 @@ class Environment:
         return self.folder / "bin" / "python"
 
     def install(self) -> None:
-        """Install what is missing and prove that it works.
+        """Install missing packages and prove that they work.
 
         Raises:
             EnvironmentFault: with a sentence for the user.
@@ -313,7 +288,7 @@ class Environment:
         if not os.access(self._root, os.W_OK):
             remedy = f"sudo chown -R $(id -un) {self._root}"
             raise EnvironmentFault(f"{self._root} cannot be written: {remedy}")
-        # What is left of packages that an update has removed: Python would import the folders.
+        # An update that removes a package leaves its __pycache__, which Python would import.
         for folder in sorted((self._root / "neuros").rglob("__pycache__"), reverse=True):
             if all(each.name == "__pycache__" for each in folder.parent.iterdir()):
                 shutil.rmtree(folder.parent)
@@ -340,9 +315,9 @@ class Environment:
         self.compile()
 
     def compile(self) -> None:
-        """Compile NeuROS's modules, so that no start has to; the folder may be read-only by then.
+        """Compile NeuROS's modules, so that no start has to; the folder may become read-only.
 
-        What cannot be compiled, or written, Python compiles at each start: no fault.
+        A module that cannot be compiled or written is no fault: Python compiles it at each start.
         """
         command = python_command(
             "compileall", "-qq", str(self._root / "neuros"), python=self.python
@@ -363,7 +338,7 @@ class Environment:
         return (major, minor) if is_ours and OLDEST <= (major, minor) <= NEWEST else None
 
     def _make(self) -> tuple[int, int]:
-        """Make it anew, empty, with the Python that runs this."""
+        """Make ``.venv`` anew, empty, with the Python that runs this."""
         self._progress.step(f"making .venv with Python {platform.python_version()}")
         # Inside a virtual environment (even the one to be replaced) venv needs the base Python.
         base = getattr(sys, "_base_executable", sys.executable)
@@ -379,29 +354,24 @@ class Environment:
         install(self.python, self._root, self.extras, self._progress, environ, newest=self._newest)
 
     def _prove(self) -> list[str]:
-        """Use every part in a process of its own; one sentence for each that fails."""
-        versions: list[str] = []
+        """Use each part in a process of its own; one sentence for each that fails."""
         faults: list[str] = []
-        for proof in (_ROS, *(_PROOFS[extra] for extra in self.extras if extra in _PROOFS)):
-            self._progress.detail(f"importing {proof.name}")
+        for name, code in _PROOFS.items():
+            if name != "ROS 2" and name.lower() not in self.extras:
+                continue
+            self._progress.detail(f"importing {name}")
             try:
-                versions.append(f"{proof.name} {self._version_of(proof)}")
-            except (ImportError, subprocess.TimeoutExpired) as error:
-                faults.append(f"{proof.name} does not import ({error})")
-        if versions:
-            self._progress.step(f"these import: {', '.join(versions)}")
+                answer = self._run(f"import neuros; {code}")
+            except subprocess.TimeoutExpired as error:
+                faults.append(f"{name} does not import ({error})")
+                continue
+            if answer.returncode:
+                rows = answer.stderr.strip().splitlines() or [f"exit code {answer.returncode}"]
+                faults.append(f"{name} does not import ({rows[-1]})")
         return faults
 
-    def _version_of(self, proof: _Proof) -> str:
-        version = f"import importlib.metadata as m; print(m.version('{proof.distribution}'))"
-        answer = self._run(f"import neuros\n{proof.code}\n{version}")
-        if answer.returncode:
-            rows = answer.stderr.strip().splitlines()
-            raise ImportError(rows[-1] if rows else f"exit code {answer.returncode}")
-        return answer.stdout.split()[-1]
-
     def _run(self, code: str) -> subprocess.CompletedProcess[str]:
-        """Run ``code`` in its Python, from a folder that holds no modules."""
+        """Run ``code`` in the Python of ``.venv``, from a folder without modules."""
         return subprocess.run(
             python_command(code=code, python=self.python),
             cwd=self.folder,

@@ -1,4 +1,4 @@
-"""Installs packages with uv, which pip installs where it is not there; explains their errors."""
+"""Installs packages with uv, and uv with pip where it is absent; explains their errors."""
 
 from __future__ import annotations
 
@@ -37,9 +37,8 @@ _PIP_INSTALL = (
     *("pip", "install", "--disable-pip-version-check", "--no-input"),
     *("--progress-bar", "off", "--only-binary", ":all:"),
 )
-# As pip: every index counts, and modules are compiled, so that no start has to.
+# As for pip, all indexes count, and not only the first that has a package.
 _UV_INSTALL = ("pip", "install", "--index-strategy", "unsafe-best-match")
-_AS_PIP = {"UV_COMPILE_BYTECODE": "1"}
 
 # Settings of pip, and the variables by which uv takes them.
 _IN_UV = {
@@ -50,28 +49,16 @@ _IN_UV = {
     "no-cache-dir": "UV_NO_CACHE",
     "trusted-host": "UV_INSECURE_HOST",
     "timeout": "UV_HTTP_TIMEOUT",
-    "default-timeout": "UV_HTTP_TIMEOUT",
     "retries": "UV_HTTP_RETRIES",
-    "constraint": "UV_CONSTRAINT",
     "cert": "SSL_CERT_FILE",
     "client-cert": "SSL_CLIENT_CERT",
-    "proxy": "HTTPS_PROXY",
+    "proxy": "ALL_PROXY",
 }
-_NOT_FOR_PROCESSOR = (
-    r"(?P<package>[\w.-]+?)(==\S+)?\s+has\s+no\s+wheels\s+with\s+a\s+matching\s+platform\s+tag"
-    r"\s+\(e\.g\.,\s+`\w*?_(?P<platform>[a-z]\w*)`\)"
-)
 _EXTRA_BYTES = {"tensorflow": 2.5e9, "dev": 0.2e9, "docs": 0.2e9, "benchmark": 0.4e9}
-_DISK_IS_FULL = "No space left on device|Disk quota exceeded"
-_OF_NO_EFFECT = {
-    *("disable-pip-version-check", "no-input", "no-color", "progress-bar", "quiet", "verbose"),
-    *("cache-dir", "log", "prefer-binary", "no-warn-script-location", "no-python-version-warning"),
-    *("root-user-action", "break-system-packages", "require-virtualenv", "config-file"),
-}
 
 
 def pip_settings(options: argparse.Namespace) -> dict[str, str]:
-    """What the options ``--wheelhouse`` and ``--ca-bundle`` mean to pip, as its environment."""
+    """The environment variables of pip for ``--wheelhouse`` and ``--ca-bundle``."""
     settings: dict[str, str] = {}
     if options.wheelhouse:
         folder = str(Path(options.wheelhouse).absolute())
@@ -130,11 +117,16 @@ def install(
         for arguments in calls:
             installer.install(arguments)
     except InstallationFailed as failure:
-        raise installer.fault(failure.output) from failure
+        rows = [row.strip() for row in failure.output.splitlines()]
+        errors = [row for row in rows if row.lower().startswith(("error", "cause", "fatal error"))]
+        for row in (errors or rows)[-4:]:
+            progress.step(f"  {row[:300]}")
+        cause = explain_failure(failure.output) or "uv failed"
+        raise EnvironmentFault(f"{cause} (log: {installer.log})") from failure
 
 
 def _locked(root: Path, *names: str) -> list[str]:
-    """The arguments that install exactly what some lock files hold."""
+    """The arguments that install the packages of some lock files."""
     files = [arg for name in names for arg in ("--requirement", str(root / LOCKS / f"{name}.txt"))]
     return ["--require-hashes", "--no-deps", *files]
 
@@ -147,7 +139,7 @@ def find_uv(python: Path) -> Path | None:
 
 
 def make_venv(command: Sequence[str], environ: Mapping[str, str]) -> str:
-    """Run the command that makes a virtual environment; returns why it failed, or nothing."""
+    """Run the command that makes a virtual environment; returns the reason of a failure, or ""."""
     python, made = command[0], answer_of(command, clean_environment(environ))
     if made is None or not made.returncode:
         return "" if made else f"{python} cannot be started"
@@ -207,25 +199,14 @@ class Installer:
             InstallationFailed: if uv fails, or is not there and cannot be installed.
             OSError: if it cannot be started, or the log cannot be written.
         """
-        uv, pip = self.require_uv(), python_command("pip", "config", "list", python=self.python)
+        # uv reads none of pip's files and variables, so pip lists its settings for uv.
+        pip = python_command("pip", "config", "list", python=self.python)
         listing = answer_of(pip, self.environ)
-        settings, unknown = uv_settings(listing.stdout if listing else "", self.environ)
-        if unknown:
-            names = ", ".join(unknown)
-            self.progress.step(f"uv has no setting like pip's {names}, and goes without")
-        if "--require-hashes" in arguments:
-            # Lock files name every version, and uv refuses a constraint without a hash.
-            settings.pop("UV_CONSTRAINT", None)
-        command = [str(uv), *_UV_INSTALL, "--python", str(python or self.python), *arguments]
-        return self._run(command, {**_AS_PIP, **self.environ, **settings})
-
-    def fault(self, output: str) -> EnvironmentFault:
-        """The error for what the program that failed has written, of which it shows the end."""
-        rows = [row.strip() for row in output.splitlines()]
-        errors = [row for row in rows if row.lower().startswith(("error", "cause", "fatal error"))]
-        for row in (errors or rows)[-4:]:
-            self.progress.step(f"  {row[:300]}")
-        return EnvironmentFault(f"{explain_failure(output) or 'uv failed'} (log: {self.log})")
+        environ = uv_environment(listing.stdout if listing else "", self.environ)
+        uv = str(self.require_uv())
+        return self._run(
+            [uv, *_UV_INSTALL, "--python", str(python or self.python), *arguments], environ
+        )
 
     def _run(self, command: Sequence[str], environ: Mapping[str, str]) -> str:
         """Run pip or uv, show what it does, and return what it wrote."""
@@ -247,7 +228,10 @@ class Installer:
                 for row in process.stdout or ():
                     file.write(row)
                     rows.append(row)
-                    _show(row, self.progress)
+                    if prepared := re.match(r"Prepared (\d+) packages", row):
+                        self.progress.step(f"unpacking {prepared[1]} packages")
+                    elif re.match(r"\s*(Collecting|Downloading|Building)", row):
+                        self.progress.detail(row.strip())
             except BaseException:
                 process.terminate()
                 raise
@@ -256,73 +240,57 @@ class Installer:
         return "".join(rows)
 
 
-def _show(row: str, progress: Progress) -> None:
-    if prepared := re.match(r"Prepared (\d+) packages", row):
-        progress.step(f"unpacking {prepared[1]} packages")
-    elif re.match(r"\s*(Collecting|Downloading|Building)", row):
-        progress.detail(row.strip())
+def uv_environment(listing: str, environ: Mapping[str, str]) -> dict[str, str]:
+    """The environment of uv: ``environ`` with the settings of pip as uv's own variables.
 
-
-def uv_settings(listing: str, environ: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
-    """The environment variables that give uv the settings of pip, and settings that uv has not.
-
-    uv reads none of pip's files and variables. Its own variables, where the user has set them,
-    stay.
+    Variables of uv that the user has set stay.
 
     Args:
-        listing: what ``pip config list`` says.
+        listing: what ``pip config list`` prints.
     """
     rows = re.findall(r"^(global|install|:env:)\.([\w-]+)=(.+)$", listing, re.MULTILINE)
     # A variable comes before a file, and a setting of one command before those of all.
     rows.sort(key=lambda row: ("global", "install", ":env:").index(row[0]))
     found = {_IN_UV[key]: str(ast.literal_eval(value)) for _, key, value in rows if key in _IN_UV}
-    unknown = sorted({key for _, key, _ in rows} - _IN_UV.keys() - _OF_NO_EFFECT)
-    if links := found.pop("UV_FIND_LINKS", ""):
-        # pip passes over a folder that is not there; for uv it is an error.
-        there = [link for link in links.split() if "://" in link or os.path.exists(link)]
-        found |= {"UV_FIND_LINKS": ",".join(there)} if there else {}
-    for name in ("UV_NO_INDEX", "UV_NO_CACHE"):
-        if found.get(name, "1").lower() in ("0", "no", "off", "false"):
-            del found[name]
-    if proxy := found.get("HTTPS_PROXY"):
-        found |= {"HTTP_PROXY": proxy, "ALL_PROXY": proxy}
-    bundle = environ.get("REQUESTS_CA_BUNDLE") or environ.get("CURL_CA_BUNDLE")
-    if "SSL_CERT_FILE" not in found and bundle:
-        found["SSL_CERT_FILE"] = bundle
-    if not any(name in found or environ.get(name) for name in ("SSL_CERT_FILE", "SSL_CERT_DIR")):
-        # Authorities of this machine, as for pip; uv has its own where there are none.
-        cafile = ssl.get_default_verify_paths().cafile
-        found |= {"UV_SYSTEM_CERTS": "1"} if cafile else {}
-    mine = {k: v for k, v in found.items() if not (k.startswith("UV_") and environ.get(k))}
-    return mine, unknown
+    if "UV_FIND_LINKS" in found:
+        found["UV_FIND_LINKS"] = ",".join(found["UV_FIND_LINKS"].split())
+    if "ALL_PROXY" in found:
+        found |= dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY"), found["ALL_PROXY"])
+    settings = {k: v for k, v in found.items() if not (k.startswith("UV_") and environ.get(k))}
+    defaults = {"UV_COMPILE_BYTECODE": "1"}  # as pip does, so that no start has to
+    if ssl.get_default_verify_paths().cafile:  # authorities of this machine, as for pip
+        defaults["UV_SYSTEM_CERTS"] = "1"
+    if bundle := environ.get("REQUESTS_CA_BUNDLE") or environ.get("CURL_CA_BUNDLE"):
+        defaults["SSL_CERT_FILE"] = bundle
+    return {**defaults, **environ, **settings}
 
 
 def explain_failure(text: str) -> str | None:
-    """One sentence, cause and remedy, for what pip or the operating system wrote, where known."""
+    """Cause and remedy, in one sentence, of an error of uv, pip or the operating system.
+
+    ``None`` for an unknown error.
+    """
     if re.search("DO NOT MATCH THE HASHES|Hash mismatch for", text):
         return (
             "a package on the index is not the one that the lock file names, and is not installed:"
             " use another index (export PIP_INDEX_URL=https://pypi.org/simple), or, if you trust"
             " this one, install.py --newest, which uses no lock files"
         )
-    if match := re.search(_NOT_FOR_PROCESSOR, text):
-        return (
-            f"the package index has no {match['package']} for this processor ({match['platform']}):"
-            f" use Docker, {IN_DOCKER}"
-        )
     if sentence := explain_machine(text):
         return sentence
     if cause := why_unsatisfiable(text):
-        return (
-            f"a package does not exist for this Python or processor ({cause}): run"
-            f" {other_python()} install.py (with --wheelhouse: or it is not in there; with an index"
-            " of your own: --newest takes the versions that it has)"
+        remedy = (
+            f"run {other_python()} install.py (with --wheelhouse: or it is not in there; with an"
+            " index of your own: --newest takes the versions that it has)"
         )
+        if "matching platform tag" in cause:
+            remedy = f"use Docker, {IN_DOCKER}"
+        return f"a package does not exist for this Python or processor ({cause}): {remedy}"
     return None
 
 
 def why_unsatisfiable(text: str) -> str:
-    """Why uv, or pip that installs uv, finds no package that will do; empty for other errors."""
+    """Why uv, or pip for uv itself, finds no fitting package; empty for other errors."""
     if found := re.search(r"ERROR: (No matching distribution found for .+)", text):
         return found[1]
     solution = r"No solution found.*?Because (.+?)(?:,\s+we\s+can\s+conclude|\n\n|\Z)"
@@ -331,9 +299,12 @@ def why_unsatisfiable(text: str) -> str:
 
 
 def explain_machine(text: str, again: str = "install.py") -> str | None:
-    """One sentence for a failure of this machine or its network; ``again`` is what to run then."""
+    """Cause and remedy of a failure of this machine or its network; ``again`` is what to run then.
+
+    ``None`` for another error.
+    """
     for pattern, sentence in (
-        (_DISK_IS_FULL, "the disk is full: make room (df -h)"),
+        ("No space left on device|Disk quota exceeded", "the disk is full: make room (df -h)"),
         (
             "CERTIFICATE_VERIFY_FAILED|invalid peer certificate",
             "the certificate of the package index is not trusted: "
