@@ -61,7 +61,7 @@ class ContainerFolder:
 
     @property
     def requirements(self) -> Path:
-        """What pip is to install in it; the file need not exist."""
+        """The requirements of its Python; the file need not exist."""
         return self.folder / "requirements.txt"
 
 
@@ -89,9 +89,9 @@ def find_container(name: str, project: Path, own: Path = OWN_FOLDER) -> Containe
 
 
 def why_no_container(container: str, project: Path, own: Path = OWN_FOLDER) -> tuple[str, str]:
-    """What is wrong with a name for which there is no folder, and a hint; empty if nothing is.
+    """The mistake in a name without a folder, and a hint; empty for a valid name.
 
-    A name with a version may be that of an image, so there only slips of the pen count.
+    A name with a version may be that of an image: only a name close to a folder's is a mistake.
     """
     name = bare_name(container)
     if not _NAME.fullmatch(name) or find_container(name, project, own) is not None:
@@ -111,10 +111,10 @@ class Recipe:
 
     Attributes:
         name: of the container.
-        folder: with the ``Dockerfile``, ``requirements.txt``, and what else goes into the image.
-        dockerfile: its text; made up where there is a ``requirements.txt`` only.
-        parents: the recipes among the images that it begins from.
-        digest: changes whenever a file of it changes, or one of a parent.
+        folder: with the ``Dockerfile``, ``requirements.txt``, and other files for the image.
+        dockerfile: its text; generated where there is only a ``requirements.txt``.
+        parents: the recipes among the images in its ``FROM`` lines.
+        digest: of its files and those of its parents.
     """
 
     name: str
@@ -129,11 +129,11 @@ class Recipe:
         return self.folder.parent == OWN_FOLDER
 
     def takes(self, base: str) -> bool:
-        """Whether it begins from ``base`` if that is its ``BASE_IMAGE``."""
+        """Whether ``BASE_IMAGE=base`` makes it begin from ``base``."""
         return base in images_in(self.dockerfile, {BASE_ARGUMENT: base})
 
     def parents_on(self, base: str | None) -> list[Recipe]:
-        """The parents that are left where ``base`` replaces the default of ``BASE_IMAGE``."""
+        """The parents where ``base`` replaces the default of ``BASE_IMAGE``."""
         if base is None:
             return list(self.parents)
         names = {bare_name(name) for name in images_in(self.dockerfile, {BASE_ARGUMENT: base})}
@@ -141,7 +141,7 @@ class Recipe:
 
     @property
     def tags(self) -> list[str]:
-        """The names of its image; NeuROS's own are the ``latest``, too, for use by hand."""
+        """The names of its image; NeuROS's own have ``latest``, too, for use by hand."""
         own = [f"{self.name}:latest"] if self.is_own else []
         return [f"{self.name}:{self.digest[:12]}", *own]
 
@@ -169,13 +169,22 @@ def _find(name: str, places: list[Path], children: tuple[str, ...]) -> Recipe | 
         raise EnvironmentFault(
             f"{folder}: the images begin from each other: {' -> '.join([*children, name])}"
         )
-    text = _dockerfile_of(folder)
+    try:
+        text = (folder / "Dockerfile").read_text("utf-8")
+    except FileNotFoundError:
+        if not (folder / "requirements.txt").is_file():
+            raise EnvironmentFault(
+                f"{folder}: there is neither a Dockerfile nor a requirements.txt in it"
+            ) from None
+        text = _FROM_REQUIREMENTS
+    except (OSError, UnicodeDecodeError) as error:
+        raise EnvironmentFault(f"{folder}/Dockerfile cannot be read: {error}") from error
     parents = tuple(
         parent
         for image in images_in(text)
         if (parent := _find(bare_name(image), places, (*children, name)))
     )
-    # An image without rclpy gets what the base has, so the base is an ancestor of all.
+    # An image without rclpy gets the base on top, so the base is an ancestor of all.
     base = _find(BASE, places[-1:], ()) if name != BASE and not parents else None
     return Recipe(name, folder, text, parents, _digest(folder, text, [*parents, base]))
 
@@ -208,21 +217,8 @@ def names_in(folder: Path) -> list[str]:
     )
 
 
-def _dockerfile_of(folder: Path) -> str:
-    try:
-        return (folder / "Dockerfile").read_text("utf-8")
-    except FileNotFoundError:
-        if (folder / "requirements.txt").is_file():
-            return _FROM_REQUIREMENTS
-        raise EnvironmentFault(
-            f"{folder}: there is neither a Dockerfile nor a requirements.txt in it"
-        ) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise EnvironmentFault(f"{folder}/Dockerfile cannot be read: {error}") from error
-
-
 def _digest(folder: Path, dockerfile: str, parents: Iterable[Recipe | None]) -> str:
-    """Of names, contents and rights to execute: what the engine gets of a folder."""
+    """Digest of the names, contents and rights to execute of the files in a folder."""
     whole = hashlib.sha256(dockerfile.encode())
     for file in files_of(folder):
         whole.update(f"\0{file.relative_to(folder)}\0{file.stat().st_mode & 0o111}\0".encode())
@@ -240,7 +236,7 @@ def files_of(folder: Path) -> Iterator[Path]:
 
 
 def for_all(entry: tarfile.TarInfo) -> tarfile.TarInfo:
-    """A file or folder in an archive, as anybody may read and nobody but root may change it."""
+    """Make an entry of an archive readable for all, and writable only for root."""
     entry.uid = entry.gid = 0
     entry.uname = entry.gname = ""
     entry.mode = 0o755 if entry.mode & 0o111 else 0o644

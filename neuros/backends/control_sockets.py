@@ -1,8 +1,7 @@
 """Control channel over a Unix socket in the run folder: for back ends on this machine.
 
-Another distribution adds a way to connect, for its own addresses ``scheme:place``, as an entry
-point of the group ``neuros.control`` with the name of the scheme: a function that takes the place
-and returns a :class:`neuros.ports.ControlStream`.
+A distribution adds addresses ``scheme:place`` by an entry point of the group ``neuros.control``
+with the name of the scheme: a function from the place to a :class:`neuros.ports.ControlStream`.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ class UnixListener:
         try:
             with _short_path(self._path) as name:
                 self._socket.bind(name)
-                os.chmod(name, 0o600)  # whatever the umask; nobody can connect before it listens
+                os.chmod(name, 0o600)  # before listen(): nobody can connect yet
         except OSError as error:
             self._socket.close()
             raise EnvironmentFault(

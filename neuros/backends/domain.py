@@ -1,9 +1,9 @@
 """Chooses the ROS domain of a run, and locks it against other runs.
 
-A lock file ``neuros-domain-<id>.lock`` in the temporary folder of the machine is locked with
-``flock`` for the run: the lock dies with the process (and its reaper, which inherits it), also
-by SIGKILL. Runs that picked the first free domain hold it exclusively; runs that were told which
-domain to use share it, so that they may join each other and no other run picks it.
+A run locks the file ``neuros-domain-<id>.lock`` in the temporary folder of the machine (``flock``).
+The lock ends with the launcher and its reaper, which inherits it, also by SIGKILL. Runs that chose
+the first free domain hold it exclusively; runs that were given a domain share it, so that they may
+join each other and no other run chooses it.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class DomainLock:
         return self._descriptor
 
     def release(self) -> None:
-        """Give it up; a second call has no effect."""
+        """Unlock the domain; a second call has no effect."""
         if self._descriptor is None or self.path is None:
             return
         remove_lock(self._descriptor, self.path)
@@ -67,10 +67,13 @@ def choose_domain(
 ) -> DomainLock:
     """The domain for a run: ``explicit``, else ``ROS_DOMAIN_ID``, else 0 or the first free one.
 
-    0, where everybody is, if the project has external topics or is started in part, since then
-    others have to find it. ``folder`` is where lock files are, normally the temporary folder that
-    all users of the machine share. Raises ``UsageError`` for an id that is none, and
-    ``EnvironmentFault`` if all domains are taken.
+    Args:
+        has_external_topics_or_partial: other programs have to find the run, so it gets domain 0.
+        folder: of the lock files; normally the temporary folder that all users share.
+
+    Raises:
+        UsageError: for an invalid id.
+        EnvironmentFault: if all domains are in use.
     """
     if folder is None:  # not TMPDIR, which may differ from user to user
         shared = Path("/tmp")
@@ -79,7 +82,12 @@ def choose_domain(
         return _told(given, "ROS_DOMAIN_ID" if explicit is None else "-d", folder)
     if has_external_topics_or_partial:
         return _told(0, "default, where other ROS nodes are", folder)
-    ports = _udp_ports()
+    ports: set[int] = set()  # UDP ports that are bound in this network namespace
+    for table in _UDP_TABLES:
+        with contextlib.suppress(OSError), open(table) as lines:
+            next(lines)
+            # "  sl  local_address ..." with local_address "0100007F:1CE8", all hexadecimal
+            ports.update(int(line.split()[1].rpartition(":")[2], 16) for line in lines)
     for domain in AUTOMATIC:
         # Another program may have a DDS participant there (DDSI-RTPS 2.5, 9.6.2): discovery is on
         # port 7400 + 250 x domain, then each participant has two more, from + 10 on.
@@ -98,7 +106,7 @@ def given_domain(explicit: int | None, environ: Mapping[str, str]) -> int | None
     """The domain that a user asks for: ``explicit``, else ``ROS_DOMAIN_ID``; else ``None``.
 
     Raises:
-        UsageError: for an id that is none.
+        UsageError: for an invalid id.
     """
     text = environ.get("ROS_DOMAIN_ID", "").strip()
     if explicit is not None:
@@ -114,8 +122,8 @@ def _told(domain: int, reason: str, folder: Path) -> DomainLock:
 
 
 def valid_domain(text: str, source: str) -> int:
-    """The domain id in a text of ``source``; raises ``UsageError`` if it is none."""
-    # Nothing but ASCII digits: int() would also take "1_0", "+1" and other scripts' digits.
+    """The domain id in a text of ``source``; raises ``UsageError`` for any other text."""
+    # Only ASCII digits: int() also accepts "1_0", "+1" and other scripts' digits.
     if text.isascii() and text.isdigit() and int(text) <= _HIGHEST:
         return int(text)
     raise UsageError(
@@ -142,7 +150,7 @@ def _lock(folder: Path, domain: int, kind: int) -> tuple[Path, int] | None:
 
 
 def _open(path: Path) -> int | None:
-    # A pipe of this name, made by another user, would hold up whoever opens it (O_NONBLOCK).
+    # Opening a pipe of this name, made by another user, would block without O_NONBLOCK.
     flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
         # Linux refuses O_CREAT on another user's file in a shared folder (fs.protected_regular).
@@ -163,14 +171,3 @@ def _open(path: Path) -> int | None:
         ) from error
     os.fchmod(descriptor, 0o666)  # whatever the umask: all users take part
     return descriptor
-
-
-def _udp_ports() -> set[int]:
-    """UDP ports that are bound in this network namespace."""
-    ports: set[int] = set()
-    for table in _UDP_TABLES:
-        with contextlib.suppress(OSError), open(table) as lines:
-            next(lines)
-            # "  sl  local_address ..." with local_address "0100007F:1CE8", all hexadecimal
-            ports.update(int(line.split()[1].rpartition(":")[2], 16) for line in lines)
-    return ports

@@ -209,7 +209,12 @@ def start_arguments(command: Sequence[str], nodes: Sequence[NodeFile]) -> list[s
     not reach the node. What it prints goes to the log of its node.
     """
     program = node_command(command, nodes)
-    scripts = [_script_line(node, node.node.script) for node in nodes if node.node.script]
+    scripts = []
+    for node in nodes:
+        if script := node.node.script:
+            variables = [f"{key}={value}" for key, value in node_environment(node).items()]
+            words = [node.node.name, str(script), str(log_file(node)), "env", *variables]
+            scripts.append(shlex.join(["run", *words]))
     if not scripts:
         return program
     lines = [_SCRIPTS.rstrip("\n"), *scripts, "trap - TERM", f"exec {shlex.join(program)}"]
@@ -239,11 +244,6 @@ def last_line(log: Path) -> str:
     return ""
 
 
-def _script_line(node: NodeFile, script: Path) -> str:
-    variables = [f"{key}={value}" for key, value in node_environment(node).items()]
-    return shlex.join(["run", node.node.name, str(script), str(log_file(node)), "env", *variables])
-
-
 def without_mark(environment: Mapping[str, str]) -> dict[str, str]:
     """An environment for any program: as it was before this Python restarted itself."""
     given = dict(environment)
@@ -257,23 +257,19 @@ def without_mark(environment: Mapping[str, str]) -> dict[str, str]:
 def with_libraries(environment: Mapping[str, str]) -> dict[str, str]:
     """An environment for this Python, which need not restart itself in it.
 
-    It is the one that the restart would make. Where the wheels do not restart Python, or not as we
-    know it, nothing is added.
+    The restart would make the same environment. Nothing is added where the wheels do not restart
+    Python, or in an unknown way.
     """
-    libraries = _library_paths()
+    # Each start of this Python has imported it. If not, importing it here would restart us.
+    find = getattr(sys.modules.get(_BOOTSTRAPPER), "get_ros_paths", None)
+    if find is None or _MARK not in os.environ:
+        return dict(environment)
+    # The folders that the wheels put in front.
+    libraries = sorted(path for path in _paths(str(find())) if _is_ours(path))
     if not libraries:
         return dict(environment)
     given = [path for path in _paths(environment.get(_LIBRARIES, "")) if path not in libraries]
     return {**environment, _LIBRARIES: os.pathsep.join([*libraries, *given]), _MARK: "1"}
-
-
-def _library_paths() -> list[str]:
-    """The folders that the wheels put in front, or none."""
-    # Each start of this Python has imported it. If not, importing it here would restart us.
-    find = getattr(sys.modules.get(_BOOTSTRAPPER), "get_ros_paths", None)
-    if find is None or _MARK not in os.environ:
-        return []
-    return sorted(path for path in _paths(str(find())) if _is_ours(path))
 
 
 def _paths(text: str) -> list[str]:

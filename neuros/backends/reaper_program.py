@@ -1,7 +1,7 @@
 """Program of the reaper process; :mod:`neuros.backends.reaper` explains it.
 
-It is on duty as soon as it can find and kill the processes of the run: the launcher waits for
-that, and for nothing else. So what takes longer to import, and only removes files, comes after.
+It answers READY as soon as it can find and kill the processes of the run; the launcher waits only
+for that. Modules that take longer to import, and only remove files, are imported after that.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.run_processes import RunProcesses
@@ -24,13 +24,12 @@ if TYPE_CHECKING:  # they take longer to import
     import subprocess
     from pathlib import Path
 
-READY = b"ready\n"
 IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP)
 KILL_DEADLINE_S = 20.0
 """A process in an uninterruptible system call outlasts even SIGKILL."""
 
-STARTED, FAILED, ENDED = "started", "failed", "ended"
-"""What the launcher hears of a process: its number, an ``OSError``, its exit code."""
+READY, STARTED, FAILED, ENDED = "ready", "started", "failed", "ended"
+"""Answers to the launcher: on duty; of a process its number, an ``OSError``, its exit code."""
 
 _PR_SET_CHILD_SUBREAPER = 36
 _GRACE_S = 4.5  # nodes have this long when the launcher died; all is gone within 6 s
@@ -45,56 +44,61 @@ class Orders:
     def __init__(self) -> None:
         self._started_s, self._monotonic_s = time.time(), time.monotonic()
         self.grace_s = _GRACE_S
+        self.is_finished = False
         self.sessions: list[int] = []
         self.paths: list[str] = []
         self.locks: list[tuple[int, str]] = []
         self.cleaners: list[tuple[str, str, str]] = []
-        self.is_finished = False
+        self._lists: dict[str, list[Any]] = {
+            "session": self.sessions,
+            "remove": self.paths,
+            "lock": self.locks,
+            "clean": self.cleaners,
+        }
 
     @property
     def started_s(self) -> float:
         """When this began, in Unix time; the clock may have been set back since then."""
         return min(self._started_s, time.time() - (time.monotonic() - self._monotonic_s))
 
-    def take(self, order: str, value: object) -> None:
-        if order == "session" and isinstance(value, int):
-            self.sessions.append(value)
-        elif order == "remove" and isinstance(value, str):
-            self.paths.append(value)
-        elif order == "lock" and isinstance(value, list):
-            self.locks.append((int(value[0]), str(value[1])))
-        elif order == "grace" and isinstance(value, (int, float)):
-            self.grace_s, self.is_finished = float(value), True
-        elif order == "clean" and isinstance(value, list):
-            module, folder, argument = map(str, value)
-            self.cleaners.append((module, folder, argument))
+    def add(self, order: str, value: Any) -> None:
+        """Remember an order, except that to start a process."""
+        if order == "grace":
+            self.grace_s, self.is_finished = value, True
+        elif order in self._lists:
+            self._lists[order].append(value)
 
 
 def main(run_id: str) -> None:
-    """Obey the launcher until the pipe on standard input closes, then clean up."""
+    """Follow the launcher's orders until the pipe on standard input closes, then clean up."""
     for number in (*IGNORED, signal.SIGCHLD):
-        signal.signal(number, lambda *_: None)  # as SIG_IGN, which processes would inherit
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, IGNORED)  # the launcher had them wait
+        signal.signal(number, lambda *_: None)  # processes would inherit SIG_IGN
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, IGNORED)  # the launcher has blocked them
     orders = Orders()
     processes = RunProcesses(run_id, os.getpid())
     children = _Children()
-    os.write(1, READY)
+    _answer(READY)
     _import_the_rest()
     for order, value in _read_orders(children):
-        orders.take(order, value)
-        if order == "session" and isinstance(value, int):
+        orders.add(order, value)
+        if order == "session":
             processes.add_session(value)
-        elif order == "start" and isinstance(value, list):
+        elif order == "start":
             children.start(*value)
         elif order == "lock":
-            os.set_inheritable(orders.locks[-1][0], False)
+            os.set_inheritable(value[0], False)
         elif order == "clean":
             _cleaners(orders)
     clean_up(run_id, orders, processes)
 
 
+def _answer(*answer: object) -> None:
+    with contextlib.suppress(OSError):  # the launcher has gone
+        os.write(1, json.dumps(answer).encode() + b"\n")
+
+
 class _Children:
-    """The processes that the launcher has had started here."""
+    """Processes that the reaper has started for the launcher."""
 
     def __init__(self) -> None:
         self._launcher = os.getppid()
@@ -108,7 +112,7 @@ class _Children:
         environment: dict[str, str],
         cores: list[int],
     ) -> None:
-        """Start one, and tell the launcher its number, or why not."""
+        """Start a process; the answer is its number, or the error."""
         import subprocess
         from pathlib import Path
 
@@ -127,32 +131,28 @@ class _Children:
                 )
         except (OSError, ValueError) as error:  # a null byte in the environment, for instance
             parts = getattr(error, "errno", None), getattr(error, "filename", None)
-            self._tell(FAILED, parts[0], getattr(error, "strerror", None) or str(error), parts[1])
+            _answer(FAILED, parts[0], getattr(error, "strerror", None) or str(error), parts[1])
         else:
             self._running[process.pid] = process
-            self._tell(STARTED, process.pid)
+            _answer(STARTED, process.pid)
 
     def reap(self) -> None:
-        """Tell the launcher which have ended; orphans of the run have come here, too."""
+        """Answer which processes have ended; orphans of the run are children of the reaper, too."""
         with contextlib.suppress(ChildProcessError):
             while (ended := os.waitpid(-1, os.WNOHANG))[0]:
                 if process := self._running.pop(ended[0], None):
                     process.returncode = os.waitstatus_to_exitcode(ended[1])
-                    self._tell(ENDED, process.pid, process.returncode)
+                    _answer(ENDED, process.pid, process.returncode)
                     if os.getppid() == self._launcher:
-                        os.kill(self._launcher, signal.SIGCHLD)  # as its own children do
-
-    def _tell(self, *news: object) -> None:
-        with contextlib.suppress(OSError):  # the launcher has gone
-            os.write(1, json.dumps(news).encode() + b"\n")
+                        os.kill(self._launcher, signal.SIGCHLD)  # as children of its own do
 
 
 @contextlib.contextmanager
 def children_on(cores: Collection[int]) -> Iterator[None]:
-    """Processes that this thread starts inside get these cores, and so do all their threads.
+    """Processes that this thread starts in this context get these cores, and all their threads.
 
-    The mask is there before the first instruction of the child: scripts, imports and the threads
-    of DDS have it, too. Without any nothing changes. Raises ``OSError`` for one that is not there.
+    The mask counts from the first instruction of the child: for scripts, imports and the threads
+    of DDS, too. An empty ``cores`` changes nothing. Raises ``OSError`` for a core that is absent.
     """
     before = os.sched_getaffinity(0)
     if cores:
@@ -164,7 +164,8 @@ def children_on(cores: Collection[int]) -> Iterator[None]:
             os.sched_setaffinity(0, before)
 
 
-def _read_orders(children: _Children) -> Iterator[tuple[str, object]]:
+def _read_orders(children: _Children) -> Iterator[tuple[str, Any]]:
+    """Orders until the launcher ends; meanwhile children that end are reaped."""
     woken, waker = os.pipe()
     os.set_blocking(waker, False)
     signal.set_wakeup_fd(waker, warn_on_full_buffer=False)
@@ -184,19 +185,19 @@ def _read_orders(children: _Children) -> Iterator[tuple[str, object]]:
 
 
 def _import_the_rest() -> None:
-    """Now, and not when it is needed: who knows what becomes of the disk until then."""
-    with contextlib.suppress(Exception):  # killing is the first duty, and needs none of it
+    """Import early: the disk may be gone when the run ends."""
+    with contextlib.suppress(Exception):  # killing is the first duty, and needs no import
         import ctypes
         import subprocess  # noqa: F401
 
-        # What a process of the run has left behind comes to this one: a daemon, for instance.
+        # Orphans of the run, such as daemons, become children of this process.
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
         import neuros.backends.shared_memory
         import neuros.ordinary_files  # noqa: F401
 
 
 def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None) -> None:
-    """End what is left of a run, after its grace period, and remove what it leaves."""
+    """End the processes of a run after its grace period, and remove its files."""
     if processes is None:
         processes = RunProcesses(run_id)
         for pid in orders.sessions:
@@ -207,26 +208,32 @@ def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None)
             cleaner.resume(argument, run_id)
 
     _end_all(processes, orders.grace_s, resume)
-    # What a killed launcher had asked for may still be on its way.
+    # Orders of a killed launcher, to an engine for instance, may still be under way.
     settle_s = 0.0 if orders.is_finished else _SETTLE_S
     for cleaner, argument in _cleaners(orders):
         cleaner.remove(argument, run_id, settle_s=settle_s, give_up_s=_REMOVE_S)
 
+    import shutil
     from pathlib import Path
 
     from neuros.backends.shared_memory import remove_dead_runs, sweep
 
     sweep(orders.started_s)
-    _remove(orders.paths)
-    for descriptor, path in orders.locks:
-        remove_lock(descriptor, Path(path))
+    for path in orders.paths:
+        with contextlib.suppress(OSError):
+            if os.path.isdir(path) and not os.path.islink(path):
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                os.unlink(path)
+    for descriptor, lock in orders.locks:
+        remove_lock(descriptor, Path(lock))
     remove_dead_runs()
 
 
 def _end_all(processes: RunProcesses, grace_s: float, resume: Callable[[], None]) -> None:
     """Wait for all processes, and kill those that are left after the grace period.
 
-    What is paused is resumed: at once, so that it can end by itself, and when it was killed.
+    Paused nodes are resumed at once, so that they can end, and again when they are killed.
     """
     now = time.monotonic()
     kill_at, give_up_at = now + grace_s, now + grace_s + KILL_DEADLINE_S
@@ -246,25 +253,14 @@ def _end_all(processes: RunProcesses, grace_s: float, resume: Callable[[], None]
 
 
 def _cleaners(orders: Orders) -> list[tuple[Any, str]]:
-    """The modules that clean up, loaded when they are announced, each with its argument."""
+    """The modules that clean up, imported as soon as they are announced, and their arguments."""
     found = []
     for module, folder, argument in orders.cleaners:
         if folder not in sys.path:
             sys.path.append(folder)
-        with contextlib.suppress(Exception):  # killing is the first duty, and needs none of it
+        with contextlib.suppress(Exception):  # killing is the first duty, and needs no import
             found.append((importlib.import_module(module), argument))
     return found
-
-
-def _remove(paths: Iterable[str]) -> None:
-    import shutil
-
-    for path in paths:
-        with contextlib.suppress(OSError):
-            if os.path.isdir(path) and not os.path.islink(path):
-                shutil.rmtree(path, ignore_errors=True)
-            else:
-                os.unlink(path)
 
 
 def remove_lock(descriptor: int, path: Path) -> None:

@@ -27,13 +27,12 @@ class _Process(NamedTuple):  # a dataclass would take the reaper 10 ms to import
 
 
 class RunProcesses:
-    """The processes of one run, without the process that asks.
+    """The processes of one run, without this process.
+
+    A process stays known when it is ending and its environment can no longer be read.
 
     Args:
-        ancestor: its descendants belong to the run, too.
-
-    Remembers whom it has seen, so that a process stays known whose environment can no longer be
-    read because it is just ending.
+        ancestor: a process whose descendants belong to the run, too.
     """
 
     def __init__(self, run_id: str, ancestor: int = -1) -> None:
@@ -43,31 +42,43 @@ class RunProcesses:
         self._known: dict[int, int] = {}
 
     def add_session(self, pid: int) -> None:
-        """All processes of the session that ``pid`` leads belong to the run."""
+        """Add all processes of the session that ``pid`` leads."""
         process = _read(pid)
         # A node process that has ended already may have left children in its session.
         self._sessions[pid] = process.start if process else -1
 
     def alive(self) -> dict[int, int]:
-        """Process ids and start times of all that still run; zombies do not count."""
+        """Process ids and start times of all processes but zombies."""
         processes = {process.pid: process for process in _all()}
         processes.pop(os.getpid(), None)
-        members = {pid for pid, process in processes.items() if self._is_member(process, processes)}
+        members = set()
+        for pid, process in processes.items():
+            leader, start = processes.get(process.session), self._sessions.get(process.session)
+            if (
+                self._known.get(pid) == process.start
+                or process.parent == self._ancestor
+                # While a session has members, the number of its dead leader is not given out again.
+                or (start is not None and (leader is None or leader.start == start))
+                or self._mark in environ_of(pid)
+            ):
+                members.add(pid)
         while children := {
             pid
             for pid, process in processes.items()
             if process.parent in members and pid not in members
         }:
             members |= children
-        self._known = {
-            pid: processes[pid].start
-            for pid in members
-            if not processes[pid].is_gone and _may_be_killed(pid)
-        }
+        self._known = {}
+        for pid in members:
+            # Some are gone by now, or have become another user's (sudo).
+            with contextlib.suppress(OSError):
+                os.kill(pid, 0)
+                if not processes[pid].is_gone:
+                    self._known[pid] = processes[pid].start
         return dict(self._known)
 
     def nodes(self) -> dict[int, str]:
-        """Process ids of those that were started for one node, and the name of that node."""
+        """Process ids of processes that were started for one node, and the name of the node."""
         found: dict[int, str] = {}
         for pid in self.alive():
             for variable in environ_of(pid):
@@ -75,17 +86,9 @@ class RunProcesses:
                     found[pid] = os.fsdecode(variable.rpartition(b"/")[2])
         return found
 
-    def _is_member(self, process: _Process, processes: dict[int, _Process]) -> bool:
-        if self._known.get(process.pid) == process.start or process.parent == self._ancestor:
-            return True
-        start = self._sessions.get(process.session)
-        if start is not None and _is_same_leader(processes.get(process.session), start):
-            return True
-        return self._mark in environ_of(process.pid)
-
 
 def environ_of(pid: int) -> list[bytes]:
-    """The environment that a process was started with, empty if it cannot be read."""
+    """The environment at the start of a process; empty if it cannot be read."""
     with contextlib.suppress(OSError), open(f"/proc/{pid}/environ", "rb") as file:
         return file.read().split(b"\0")
     return []
@@ -95,19 +98,6 @@ def started_at(pid: int) -> int | None:
     """When a process started, in clock ticks since boot; ``None`` if there is none."""
     process = _read(pid)
     return None if process is None or process.is_gone else process.start
-
-
-def _is_same_leader(leader: _Process | None, start: int) -> bool:
-    """While a session has members, the number of its dead leader is not given out again."""
-    return leader is None or leader.start == start
-
-
-def _may_be_killed(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except OSError:  # gone, or it has become another user's (sudo)
-        return False
-    return True
 
 
 def _all() -> Iterator[_Process]:

@@ -35,7 +35,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping, Set
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -59,10 +59,10 @@ def sweep(
 ) -> tuple[str, ...]:
     """Remove what dead nodes of this user left since ``started_s`` (Unix time, seconds).
 
-    Looks every ``look_again_s``, and removes what nobody holds in two looks in a row: a node that
-    is just starting makes its files a moment before it locks them. What is held three times in a
-    row is alive: other sweeps, and Fast DDS in the neighbours, lock files for a moment to see
-    whether they can. Returns the names removed.
+    Samples every ``look_again_s``, and removes files that nobody holds in two samples in a row: a
+    starting node makes its files a moment before it locks them. Files that are held three times
+    in a row are in use: other sweeps, and Fast DDS in the neighbours, lock files for a moment to
+    test them. Returns the names removed.
     """
     removed: list[str] = []
     looks: list[dict[_Files, bool]] = [_are_held(folder, started_s)]
@@ -84,7 +84,7 @@ class _Found(NamedTuple):  # a dataclass would take the reaper 10 ms to import
 
 
 def _are_held(folder: Path, started_s: float) -> dict[_Files, bool]:
-    """Whether somebody holds each group of files."""
+    """Whether a process holds each group of files."""
     fresh = []
     for base, group in _groups(folder).items():
         since_s = 0.0 if _LTTNG.fullmatch(base) else started_s - _CLOCK_SLACK_S
@@ -92,7 +92,20 @@ def _are_held(folder: Path, started_s: float) -> dict[_Files, bool]:
         is_ours = all(file.st_uid == os.getuid() for file in files)
         if is_ours and any(file.st_mtime >= since_s for file in files):
             fresh.append(group)
-    mapped = _mapped(folder, {name for group in fresh if not group.locks for name in group.files})
+    # Names that a process has mapped, as far as this user can see. All mappings are megabytes: the
+    # search stops once it has found all names.
+    prefix = f"{folder}/".encode()
+    names = {name for group in fresh if not group.locks for name in group.files}
+    mapped: set[str] = set()
+    for pid in filter(str.isdigit, os.listdir("/proc")):
+        if mapped >= names:
+            break
+        # Processes end meanwhile, and those of other users cannot be read.
+        with contextlib.suppress(OSError), open(f"/proc/{pid}/maps", "rb") as maps:
+            for line in maps:
+                _, is_there, name = line.rstrip(b"\n").partition(prefix)
+                if is_there:
+                    mapped.add(os.fsdecode(name))
     held = {}
     for group in fresh:
         key = tuple(sorted((name, stat.st_ino) for name, stat in group.files.items()))
@@ -119,25 +132,6 @@ def _groups(folder: Path) -> Mapping[str, _Found]:
     return found
 
 
-def _mapped(folder: Path, names: Set[str]) -> Set[str]:
-    """Those of ``names`` in ``folder`` that a process has mapped, as far as it can be seen.
-
-    The mappings of all processes are megabytes: it stops once it has found all names.
-    """
-    prefix = f"{folder}/".encode()
-    found: set[str] = set()
-    for pid in filter(str.isdigit, os.listdir("/proc")):
-        if found >= names:
-            break
-        # Processes end while we look, and those of other users do not let us in.
-        with contextlib.suppress(OSError), open(f"/proc/{pid}/maps", "rb") as maps:
-            for line in maps:
-                _, is_there, name = line.rstrip(b"\n").partition(prefix)
-                if is_there:
-                    found.add(os.fsdecode(name))
-    return found
-
-
 def _remove(folder: Path, files: Iterable[tuple[str, int]]) -> Iterator[str]:
     for name, inode in files:
         with contextlib.suppress(OSError):
@@ -160,9 +154,9 @@ def hold(folder: Path) -> int:
 def remove_dead_runs(
     folder: Path = Path("/dev/shm"), *, look_again_s: float = _LOOK_AGAIN_S
 ) -> tuple[str, ...]:
-    """Remove what dead runs of this user have left; returns the names removed.
+    """Remove the files of dead runs of this user; returns the names removed.
 
-    Looks twice: what has just been made is locked a moment later.
+    A file counts if it has no lock twice: a new file is locked a moment later.
     """
     first = _dead(folder)
     if not first:
