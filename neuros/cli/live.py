@@ -1,7 +1,7 @@
 """``neuros ps``, ``stop``, ``topic`` and ``logs``: runs in progress, from another terminal.
 
-None of them needs ROS 2. What packets hold is sampled by the nodes, as for the dashboard, and comes
-over the control channel: so it is the same on every back end, with --isolate, too.
+None of them needs ROS 2. The nodes sample packets, as for the dashboard, and send the samples over
+the control channel: this works on every back end, and with --isolate.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,7 +30,6 @@ from neuros.project.suggest import did_you_mean, listed
 
 if TYPE_CHECKING:
     from neuros.control import NodeStatus
-    from neuros.project.model import NodeFile
 
 _RUN = "the id that `neuros ps` shows (its first digits are enough), or the name of a project"
 _ECHO_PERIOD_S = 0.1
@@ -96,7 +95,10 @@ class _RunningNode:
 
 def _ps(options: argparse.Namespace) -> int:
     found = sessions()
-    wanted = [_filter(text) for text in options.filter]
+    wanted = [text.partition("=")[::2] for text in options.filter]
+    for text, (key, _) in zip(options.filter, wanted, strict=True):
+        if "=" not in text or key not in _FILTERS:
+            raise UsageError(f"ps: --filter {text}: it must be KEY=VALUE, with {listed(_FILTERS)}")
     rows = [
         row
         for session in found
@@ -115,20 +117,17 @@ def _ps(options: argparse.Namespace) -> int:
     return 0
 
 
-def _filter(text: str) -> tuple[str, str]:
-    key, separator, value = text.partition("=")
-    if not separator or key not in _FILTERS:
-        raise UsageError(f"ps: --filter {text}: it must be KEY=VALUE, with {listed(_FILTERS)}")
-    return key, value
-
-
 def _rows(session: Session) -> Iterator[_RunningNode]:
     prefix = f"{session.namespace}/" if session.namespace else ""
+    try:
+        user = pwd.getpwuid(session.user).pw_name
+    except KeyError:
+        user = str(session.user)
     for node, state in session.states().items():
         machine = session.elsewhere.get(node)
         yield _RunningNode(
             session.run,
-            _user_name(session.user),
+            user,
             session.project,
             prefix + node,
             f"{session.backend} on {machine}" if machine else session.backend,
@@ -152,13 +151,6 @@ def _table(rows: Sequence[_RunningNode], *, shows_users: bool) -> str:
     return str(tabulate(cells, headers=header))
 
 
-def _user_name(user: int) -> str:
-    try:
-        return pwd.getpwuid(user).pw_name
-    except KeyError:
-        return str(user)
-
-
 def _stop(options: argparse.Namespace) -> int:
     found = sessions()
     chosen = _chosen_runs(options.runs, found, is_all=options.all)
@@ -166,7 +158,15 @@ def _stop(options: argparse.Namespace) -> int:
         print("you have no run in progress" if found else "nothing is running")
     for session in chosen:
         session.interrupt()
-    _await_end(chosen)
+    next_remark_s = time.monotonic() + _REMARK_S
+    waiting = {session.run for session in chosen}
+    # A run has ended when its reaper has gone.
+    while waiting := waiting & {session.run for session in sessions()}:
+        if time.monotonic() >= next_remark_s:
+            next_remark_s += _REMARK_S
+            left = " ".join(sorted(run[:_SHOWN] for run in waiting))
+            print(f"still ending: {left}; `neuros stop {left}` once more kills", file=sys.stderr)
+        time.sleep(_POLL_S)
     for session in chosen:
         print(f"stopped {session.run[:_SHOWN]} ({session.project}); run folder {session.folder}")
     for name in remove_dead_runs():
@@ -177,10 +177,10 @@ def _stop(options: argparse.Namespace) -> int:
 def _chosen_runs(
     names: Sequence[str], found: Sequence[Session], *, is_all: bool
 ) -> Sequence[Session]:
-    """The runs that are named, among those that there are; without a name, the only one.
+    """The named runs among those in progress; without a name, the only one.
 
     Raises:
-        UsageError: if there is none of a name, or several and no name.
+        UsageError: for a name without a run, or several runs and no name.
     """
     own = [session for session in found if session.is_own]
     if is_all or (not names and len(own) <= 1):
@@ -199,29 +199,18 @@ def _is_named(session: Session, name: str) -> bool:
     return is_project or (bool(name) and session.run.startswith(name))
 
 
-def _await_end(chosen: Sequence[Session]) -> None:
-    """Until the reapers have gone, and with them all that they guard."""
-    next_remark_s = time.monotonic() + _REMARK_S
-    waiting = {session.run for session in chosen}
-    while waiting := waiting & {session.run for session in sessions()}:
-        if time.monotonic() >= next_remark_s:
-            next_remark_s += _REMARK_S
-            left = " ".join(sorted(run[:_SHOWN] for run in waiting))
-            print(f"still ending: {left}; `neuros stop {left}` once more kills", file=sys.stderr)
-        time.sleep(_POLL_S)
-
-
 # ---------------------------------------------------------------------- topic
 
 
 @dataclass(frozen=True)
 class _Topic:
-    """What packets of a run go through.
+    """A topic of a run.
 
     Attributes:
         name: on the ROS graph.
         connection: ``a.out -> b.in``; empty for an external topic.
-        node, port: who samples its packets, and under which name; empty: nobody in this run.
+        node, port: the node that samples its packets, and their name there; empty if no node of
+            this run does.
     """
 
     name: str
@@ -232,7 +221,7 @@ class _Topic:
 
     @property
     def calls(self) -> set[str]:
-        """What it may be called."""
+        """Its names on the command line."""
         return {self.name, self.connection or self.name, f"{self.node}.{self.port}"}
 
 
@@ -302,26 +291,16 @@ def _echo(options: argparse.Namespace) -> int:
 def _hz(options: argparse.Namespace) -> int:
     session = _run(options.run)
     topic = _named([each for each in _topics(session) if each.connection], options.topic)
-    statuses = _watch(session, {}, topic.node, _HZ_PERIOD_S)
-    for per_s in islice(_rates(statuses, topic.connection), options.count):
+    counters = (status.counters for status in _watch(session, {}, topic.node, _HZ_PERIOD_S))
+    sent = ((c.now_s, c.metrics["outgoing"][topic.connection]["sent"]) for c in counters if c)
+    pairs = (pair for pair in pairwise(sent) if pair[0][0] < pair[1][0])
+    for (then_s, before), (now_s, now) in islice(pairs, options.count):
+        per_s = (now - before) / (now_s - then_s)
         if options.format == JSON:
             print(json.dumps({"packets_per_s": per_s}), flush=True)
         else:
             print(f"{per_s:.2f} packets/s", flush=True)
     return 0
-
-
-def _rates(statuses: Iterator[NodeStatus], connection: str) -> Iterator[float]:
-    """Packets sent per second, between each two statuses."""
-    last: tuple[float, int] | None = None
-    for status in statuses:
-        if status.counters is None:
-            continue
-        now_s = status.counters.now_s
-        sent = status.counters.metrics["outgoing"][connection]["sent"]
-        if last is not None and now_s > last[0]:
-            yield (sent - last[1]) / (now_s - last[0])
-        last = now_s, sent
 
 
 def _watch(
@@ -330,7 +309,7 @@ def _watch(
     node: str,
     period_s: float = _ECHO_PERIOD_S,
 ) -> Iterator[NodeStatus]:
-    """What a node answers, asked again and again until the run is over."""
+    """Statuses of a node, one each period until the run is over."""
     from neuros.backends.control_sockets import connect
     from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, Watch
     from neuros.control.link import ControlLink
@@ -357,7 +336,7 @@ def _watch(
 
 
 def _run(name: str) -> Session:
-    """The run of that name. Raises ``UsageError`` if there is not one of it."""
+    """The only run of that name. Raises ``UsageError`` for none or several."""
     found = _chosen_runs([name], sessions(), is_all=False)
     if len(found) > 1:
         several = ", ".join(session.run[:8] for session in found)
@@ -378,12 +357,27 @@ def _topics(session: Session) -> list[_Topic]:
 
 
 def _topics_of(folder: Path) -> list[_Topic]:
-    """Those of the node that has this folder, in which it may have left anything."""
+    """Topics of the node with this folder, whose files the node may have damaged."""
     from neuros.recording.run_file import read_node_file
 
     again = "`neuros topic` needs it: launch the project again"
     try:
-        return [*_topics_in(read_node_file(folder))]
+        file = read_node_file(folder)
+        node, found = file.node, []
+        for c in file.connections:
+            name = f"{c.topic}/data"
+            if c.source_node == node.name:
+                kind = node.output(c.source_output).type
+                found.append(_Topic(name, kind, str(c), node.name, c.source_output))
+            else:
+                found.append(_Topic(name, node.input(c.destination_input).type, str(c)))
+        ports = [(p, p.external_topic) for p in node.inputs]
+        ports += [(p, p.name) for p in node.outputs]
+        for port, sampled in ports:
+            if port.external_topic is not None:
+                name = file.names.resolve(port.external_topic, node.name)
+                found.append(_Topic(name, port.type, "", node.name, sampled or ""))
+        return found
     except OSError as error:
         raise EnvironmentFault(
             f"{error.filename} is not there: the run is ending, or somebody has removed its files"
@@ -394,23 +388,6 @@ def _topics_of(folder: Path) -> list[_Topic]:
         raise EnvironmentFault(
             f"{folder / 'node.json'} is broken: it has no port {error}; {again}"
         ) from error
-
-
-def _topics_in(file: NodeFile) -> Iterator[_Topic]:
-    node = file.node
-    for c in file.connections:
-        name = f"{c.topic}/data"
-        if c.source_node == node.name:
-            kind = node.output(c.source_output).type
-            yield _Topic(name, kind, str(c), node.name, c.source_output)
-        else:
-            yield _Topic(name, node.input(c.destination_input).type, str(c))
-    for ports, is_input in ((node.inputs, True), (node.outputs, False)):
-        for port in ports:
-            if port.external_topic is not None:
-                name = file.names.resolve(port.external_topic, node.name)
-                seen = port.external_topic if is_input else port.name
-                yield _Topic(name, port.type, "", node.name, seen)
 
 
 def _named(topics: Sequence[_Topic], wanted: str) -> _Topic:

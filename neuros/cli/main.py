@@ -113,7 +113,7 @@ class _Parser(argparse.ArgumentParser):
         return options, unknown
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
-        """As argparse does, but with what was probably meant, or the extension that has it."""
+        """As argparse does, with a suggestion, or the extension that has the command."""
         if action.choices is None or value in action.choices:
             return
         shown = [str(each) for each in action.choices]
@@ -130,7 +130,7 @@ class _Parser(argparse.ArgumentParser):
         raise argparse.ArgumentError(None, f"there is no {what} '{value}' ({hint})")
 
     def _get_value(self, action: argparse.Action, text: str) -> Any:
-        """As argparse does, but says what is wanted in words, not by the name of a function."""
+        """As argparse does, but names the wanted value in words, not by a function."""
         try:
             return super()._get_value(action, text)
         except argparse.ArgumentError as error:
@@ -162,7 +162,11 @@ def main(arguments: Sequence[str]) -> int:
     """Run one command; returns its exit code. Errors are written for the user."""
     if "_ARGCOMPLETE" in os.environ:  # a shell asks what fits: this ends the process
         _complete(os.environ.get("COMP_LINE", ""))
-    _open_standard_streams()
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:  # closed: the next file would get its number
+            os.open(os.devnull, os.O_RDWR)
     command = COMMANDS.get(_command_in(arguments))
     if command is not None and not command.is_for_people:
         return _main(arguments)
@@ -171,7 +175,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _main(arguments: Sequence[str]) -> int:
-    # As in nodes. On its import NumPy would start threads, which spin for 50 ms.
+    # As in nodes. NumPy would start threads on its import, which spin for 50 ms.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not arguments:
         parser("").print_help(sys.stderr)
@@ -187,7 +191,7 @@ def _main(arguments: Sequence[str]) -> int:
         finally:
             _keep_for_good()
             gc.enable()
-        if command != "launch":  # that has Ctrl+C wait until it can heed it
+        if command != "launch":  # launch unblocks Ctrl+C when it can handle it
             signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
         code = int(options.command(options))
         _flush()
@@ -254,10 +258,9 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
 
 @cache
 def _keep_for_good() -> None:
-    """Leave what is imported to itself; once, since Python programs may run many commands.
+    """Freeze all imported objects; once, since Python programs may run many commands.
 
-    It stays to the end, and rounds of the garbage collector through all of it were 25 ms of the
-    processor time of a launch.
+    Rounds of the garbage collector through them took 25 ms of the processor time of a launch.
     """
     gc.freeze()
 
@@ -284,30 +287,21 @@ def _complete(line: str) -> None:
 
 
 def _with_help(commands: argparse._SubParsersAction[Any]) -> list[str]:
-    """The commands that are shown; the others are programs that NeuROS starts itself."""
+    """The commands for people; NeuROS itself starts the others."""
     return [each.dest for each in commands._choices_actions]
 
 
 def _flush() -> None:
-    """Have it noticed here if the output cannot be written, or nobody reads it any more."""
+    """Raise errors of writing here, and not when Python ends."""
     if sys.stdout is not None:
         sys.stdout.flush()
 
 
 def _give_up_output() -> None:
-    """Python must not try again to write when it ends."""
+    """Keep Python from writing again when it ends."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def _complain(text: str) -> None:
     with contextlib.suppress(OSError):  # its reader has gone
         print(text, file=sys.stderr)
-
-
-def _open_standard_streams() -> None:
-    """Where one of the three was closed, its number would go to the next file that is opened."""
-    for descriptor in (0, 1, 2):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            os.open(os.devnull, os.O_RDWR)

@@ -15,7 +15,7 @@ from pathlib import Path
 from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener, connect_by
 from neuros.errors import EnvironmentFault
 from neuros.node.process import NodeProcess
-from neuros.ports import ControlListener, Middleware, PacketRecorder
+from neuros.ports import Middleware, PacketRecorder
 from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
 from neuros.recording.provenance import note_versions
@@ -38,7 +38,7 @@ def add_node(node: argparse.ArgumentParser) -> None:
 
 def _run_node(options: argparse.Namespace) -> int:
     """Run the nodes of the given ``node.json`` files until they are asked to end."""
-    # Among what is frozen, Python does not find the files that a plugin has left open.
+    # At exit Python closes the files that a plugin left open, but not among frozen objects.
     atexit.register(gc.unfreeze)
     faulthandler.enable()  # a plugin that crashes in C leaves its Python stack in the log
     files = node_files_from_json(json.loads(Path(p).read_text()) for p in options.node_files)
@@ -61,40 +61,37 @@ def _run_node(options: argparse.Namespace) -> int:
         )
 
         def close(process: int = os.getpid()) -> None:
-            if os.getpid() == process:  # a fork of it has no ROS
+            if os.getpid() == process:  # a fork has no ROS
                 middleware.close()
 
-        atexit.register(close)  # before plugins are loaded, so that what they register comes first
+        atexit.register(close)  # before plugins register functions of their own, which run first
         return middleware
 
     run_folder = files[0].folders.run
-    has_session = options.held and options.one_process
+    listener = None
+    if options.held and options.one_process:
+        listener = UnixListener(run_folder, SESSION_SOCKET_NAME)
+        try:
+            listener.open()
+        except EnvironmentFault:  # the session steps through the supervisor, only slower
+            listener = None
+    open_recorder = None
+    if options.record:
+        from neuros.recording import spool
+        from neuros.recording.recording_plan import load_plan
+
+        plan = load_plan(run_folder)
+
+        def open_recorder(file: NodeFile) -> PacketRecorder:
+            return spool.open_recorder(plan, run_folder, file.node.name)
+
     return NodeProcess(
         files,
         make_middleware,
         partial(connect_by, os.environ),
-        open_recorder=_recorders(run_folder) if options.record else None,
+        open_recorder=open_recorder,
         duration_sim_s=options.duration_sim,
         is_held=options.held,
-        session=_session_listener(run_folder) if has_session else None,
+        session=listener,
         own_logs=options.one_process,
     ).run()
-
-
-def _session_listener(run_folder: Path) -> ControlListener | None:
-    """Listens to the session; where that cannot be, it steps by the supervisor, only slower."""
-    listener = UnixListener(run_folder, SESSION_SOCKET_NAME)
-    try:
-        listener.open()
-    except EnvironmentFault:
-        return None
-    return listener
-
-
-def _recorders(run: Path) -> Callable[[NodeFile], PacketRecorder]:
-    """Makes the packet recorders of nodes by the recording plan of the run."""
-    from neuros.recording.recording_plan import load_plan
-    from neuros.recording.spool import open_recorder
-
-    plan = load_plan(run)
-    return lambda file: open_recorder(plan, run, file.node.name)

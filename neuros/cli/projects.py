@@ -9,9 +9,7 @@ import re
 import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from neuros.cli.common import (
     JSON,
@@ -26,10 +24,6 @@ from neuros.cli.common import (
 from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import NeurosError, ProjectError, UsageError
 from neuros.project.suggest import counted, did_you_mean
-
-if TYPE_CHECKING:
-    from neuros.project.model import Project
-
 
 EXIT_NODE = 1
 EXIT_PROJECT = 3
@@ -55,11 +49,18 @@ def add_validate(validate: argparse.ArgumentParser) -> None:
 
 
 def _validate(parsed: argparse.Namespace) -> int:
+    from neuros.api.loading import foreseen_failures, import_problems, model_problems
     from neuros.project.loops import Loops
 
     is_json = parsed.format == JSON
     try:
-        project = _validated(parsed)
+        project, messages, warnings = load_quietly(parsed)
+        problems = [*model_problems(project), *foreseen_failures(project, messages)]
+        show_warnings(each for each in warnings if each not in problems)
+        if not problems and parsed.imports:
+            problems = import_problems(project, messages, project_path(parsed), parsed.set)
+        if problems:
+            raise ProjectError(problems)
     except ProjectError as error:
         if not is_json:
             raise
@@ -78,22 +79,8 @@ def _validate(parsed: argparse.Namespace) -> int:
     return 0
 
 
-def _validated(parsed: argparse.Namespace) -> Project:
-    """The project, without a problem. Raises ``ProjectError``."""
-    from neuros.api.loading import foreseen_failures, import_problems, model_problems
-
-    project, messages, warnings = load_quietly(parsed)
-    problems = [*model_problems(project), *foreseen_failures(project, messages)]
-    show_warnings(each for each in warnings if each not in problems)
-    if not problems and parsed.imports:
-        problems = import_problems(project, messages, project_path(parsed), parsed.set)
-    if problems:
-        raise ProjectError(problems)
-    return project
-
-
 def add_import_plugin(command: argparse.ArgumentParser) -> None:
-    """Add the arguments of what ``validate --import`` runs for each node."""
+    """Add the arguments of the program that ``validate --import`` runs for each node."""
     command.add_argument("name")
     command.add_argument("project")
     command.add_argument("--set", action="append", default=[])
@@ -102,7 +89,7 @@ def add_import_plugin(command: argparse.ArgumentParser) -> None:
 
 
 def _import_plugin(options: argparse.Namespace) -> int:
-    """Import the plugin of one node as a run would; what is wrong with it is the answer."""
+    """Import the plugin of one node as a run would; the answer is its error, or empty."""
     from neuros.testing import PluginHarness
 
     with os.fdopen(options.answer, "w", encoding="utf-8", errors="backslashreplace") as answer:
@@ -188,15 +175,6 @@ _SCHEMA = re.compile(r'(?<="\$schema": ")[./]*/schema/')
 _IN_GALLERY = re.compile(r"^## \[.*\]\((.*)/README\.md\)\n\n([^.]*\.(?=\s))", re.MULTILINE)
 
 
-@dataclass(frozen=True)
-class _Example:
-    """A row of ``neuros example``."""
-
-    name: str
-    description: str
-    folder: Path
-
-
 def add_new(new: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     new.description = (
@@ -230,44 +208,33 @@ def add_example(example: argparse.ArgumentParser) -> None:
 
 
 def _example(options: argparse.Namespace) -> int:
-    found = _examples()
-    if options.name is None and options.format == JSON:
-        print_json([*found.values()])
-    elif options.name is None:
-        for each in found.values():
-            print(f"{each.name:18} {each.description}")
+    # In the order of the gallery, each with the first sentence about it.
+    gallery = _IN_GALLERY.findall((EXAMPLES / "README.md").read_text("utf-8"))
+    folders = {Path(inside).name: EXAMPLES / inside for inside, _ in gallery}
+    descriptions = {Path(inside).name: " ".join(text.split()) for inside, text in gallery}
+    name = options.name
+    if name is None and options.format == JSON:
+        rows = [(each, descriptions[each], folders[each]) for each in folders]
+        print_json([dict(zip(("name", "description", "folder"), row, strict=True)) for row in rows])
+    elif name is None:
+        for each in folders:
+            print(f"{each:18} {descriptions[each]}")
         print("\nneuros example NAME copies one into a folder of its own")
-    elif options.name in found:
-        _copy_example(found[options.name], options.folder or Path(options.name))
+    elif name in folders:
+        folder = options.folder or Path(name)
+        # The commands on its pages are for the folder of the copy.
+        inside = folders[name].relative_to(EXAMPLES.parent)
+        renamed = {f"{inside}": f"{folder}", "./launch.py": "neuros launch", ".venv/bin/": ""}
+        _copy(folders[name], folder, renamed)
+        files = sorted({*folder.glob("*.json")} - {folder / "project.json"})
+        others = [file.name for file in files if "nodes" in json.loads(file.read_text("utf-8"))]
+        print(f"copied to {folder}; the next command: neuros launch {folder}")
+        if others:
+            print(f"variants of it, as neuros launch {folder / others[0]}: {', '.join(others)}")
     else:
-        hint = did_you_mean(options.name, found) or f"there are {', '.join(found)}"
-        raise UsageError(f"there is no example '{options.name}' ({hint})")
+        hint = did_you_mean(name, folders) or f"there are {', '.join(folders)}"
+        raise UsageError(f"there is no example '{name}' ({hint})")
     return 0
-
-
-def _examples() -> Mapping[str, _Example]:
-    """By name, in the order of the gallery, with the first sentence that it says on them."""
-    gallery = (EXAMPLES / "README.md").read_text("utf-8")
-    found = {}
-    for inside, sentence in _IN_GALLERY.findall(gallery):
-        folder = EXAMPLES / inside
-        found[folder.name] = _Example(folder.name, " ".join(sentence.split()), folder)
-    return found
-
-
-def _copy_example(example: _Example, folder: Path) -> None:
-    """Copy it, with its commands as they are to be given beside the copy."""
-    inside = example.folder.relative_to(EXAMPLES.parent)
-    renamed = {f"{inside}": f"{folder}", "./launch.py": "neuros launch", ".venv/bin/": ""}
-    _copy(example.folder, folder, renamed)
-    others = sorted(file.name for file in folder.glob("*.json") if _is_variant(file))
-    print(f"copied to {folder}; the next command: neuros launch {folder}")
-    if others:
-        print(f"variants of it, as neuros launch {folder / others[0]}: {', '.join(others)}")
-
-
-def _is_variant(file: Path) -> bool:
-    return file.name != "project.json" and "nodes" in json.loads(file.read_text("utf-8"))
 
 
 def _copy(source: Path, folder: Path, renamed: Mapping[str, str]) -> None:

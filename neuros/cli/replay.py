@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from neuros.distribution import python_command
 from neuros.errors import EnvironmentFault, UsageError
@@ -21,7 +21,6 @@ from neuros.project.suggest import counted
 
 if TYPE_CHECKING:
     from neuros.api.run_record import PastRun
-    from neuros.bag import RecordedTopic
     from neuros.hooks import HookSpec
     from neuros.project.model import NodeFile
     from neuros.replay.replayed_node import ReplayedNode
@@ -107,7 +106,7 @@ def add_replay(replay: argparse.ArgumentParser) -> None:
 
 
 def add_replayed(replayed: argparse.ArgumentParser) -> None:
-    """Add the arguments of what ``replay --node`` becomes; people do not start it."""
+    """Add the arguments of the program that ``replay --node`` becomes."""
     replayed.add_argument("node_file")
     replayed.add_argument("--run", required=True)
     replayed.add_argument("--pdb", action="store_true")
@@ -137,6 +136,7 @@ def _replay(options: argparse.Namespace) -> int:
     from neuros.backends.domain import given_domain
     from neuros.bag import open_bag
     from neuros.cli.environments import find_messages_of
+    from neuros.recording.recording_plan import is_named
     from neuros.transport.ros_topics import RosTopic, play
 
     domain_id = given_domain(options.domain_id, os.environ)
@@ -144,7 +144,12 @@ def _replay(options: argparse.Namespace) -> int:
     with open_bag(options.run) as bag:
         if bag.damage is not None:
             print(f"neuros: {bag.damage}", file=sys.stderr)
-        chosen = _chosen([*bag.topics.values()], options.replay_topics)
+        topics, patterns = [*bag.topics.values()], options.replay_topics
+        for pattern in patterns:
+            if not any(is_named(t.name, t.connection, [pattern]) for t in topics):
+                there = ", ".join(t.connection or t.name for t in topics)
+                raise UsageError(f"--topic {pattern}: the bag has no such topic; it has {there}")
+        chosen = [t for t in topics if is_named(t.name, t.connection, patterns)]
         packets = sorted(
             (packet.log_time_ns, topic.name, packet.data)
             for topic in chosen
@@ -160,17 +165,6 @@ def _replay(options: argparse.Namespace) -> int:
         )
     print(f"{sent} packets on {len(chosen)} topics")
     return 0
-
-
-def _chosen(topics: Sequence[RecordedTopic], patterns: Sequence[str]) -> list[RecordedTopic]:
-    """The topics that are asked for. Raises ``UsageError`` if a pattern fits none."""
-    from neuros.recording.recording_plan import is_named
-
-    for pattern in patterns:
-        if not any(is_named(t.name, t.connection, [pattern]) for t in topics):
-            there = ", ".join(t.connection or t.name for t in topics)
-            raise UsageError(f"--topic {pattern}: the bag has no such topic; it has {there}")
-    return [t for t in topics if is_named(t.name, t.connection, patterns)]
 
 
 def _replay_node(options: argparse.Namespace) -> int:
@@ -211,8 +205,7 @@ def _replay_node(options: argparse.Namespace) -> int:
 
 
 def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
-    """The Python that a node is replayed with, made if it has to be; and the exit code of a signal
-    that ended that, else 0.
+    """The Python of the node, made if necessary, and the exit code of a signal meanwhile, else 0.
 
     Raises:
         EnvironmentFault: if it cannot be made.
@@ -259,7 +252,7 @@ def _replayed(options: argparse.Namespace) -> int:
 
 
 def _run(node: ReplayedNode, *, use_pdb: bool) -> bool:
-    """Replay it; returns whether the user has left a debugger."""
+    """Replay the node; returns whether the user has left a debugger."""
     from neuros.replay.replayed_node import Debugger, is_quit
 
     debugger = Debugger() if use_pdb else None
@@ -294,7 +287,10 @@ def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> i
         print(f"left after {counted(node.starts, 'start')} of hooks; identical so far: {packets}")
         return EXIT_LEFT
     if node.failure is not None and node.difference is None:
-        if not _failed_alike(node, run.record, name):
+        # The run ended with a failure of this node, at this very start of a hook.
+        record = run.record
+        is_named = bool(record["exit_code"]) and name in record["reason"]
+        if not is_named or node.expects_start:
             if ran_in_container(run) and (lack := missing_module(node.failure)):
                 raise not_here(run, name, lack)
             first = str(node.failure).partition("\n")[0]
@@ -314,13 +310,8 @@ def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> i
     return EXIT_IDENTICAL
 
 
-def _failed_alike(node: ReplayedNode, record: Any, name: str) -> bool:
-    """Whether the run had ended with a failure of the node, at this very start of a hook."""
-    return bool(record["exit_code"]) and name in record["reason"] and not node.expects_start
-
-
 def _folder(output: str | None) -> Path:
-    """What is the run folder for the replayed node."""
+    """The run folder of the replayed node."""
     if output is None:
         import tempfile
 

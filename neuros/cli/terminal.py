@@ -1,6 +1,6 @@
-"""What commands print does nothing to the terminal that it may go to.
+"""Filters the output of commands, so that printed text cannot control the terminal.
 
-Names, descriptions, packets, files of robots and errors of plugins hold what somebody else wrote.
+Names, descriptions, packets, files of robots and errors of plugins come from others.
 """
 
 from __future__ import annotations
@@ -14,26 +14,23 @@ from typing import Any, TextIO
 from neuros.errors import printable
 
 _CLEAR = "\r\x1b[K"
-"""What our own progress begins with, to take the place of the line before."""
+"""Begins each line of progress, which replaces the line before."""
 
 
 @contextlib.contextmanager
 def harmless_output() -> Iterator[None]:
-    """In the block, all text of this process for its standard streams is filtered."""
+    """Filter all text for the standard streams in this context."""
     streams = sys.stdout, sys.stderr
-    sys.stdout, sys.stderr = map(_harmless, streams)
+    filtered: list[Any] = [stream and _Harmless(stream) for stream in streams]
+    sys.stdout, sys.stderr = filtered
     try:
         yield
     finally:
         sys.stdout, sys.stderr = streams
 
 
-def _harmless(stream: TextIO) -> Any:
-    return stream if stream is None else _Harmless(stream)
-
-
 class _Harmless:
-    """A stream that spells control characters out, but colours where there are to be some."""
+    """A stream that spells control characters out, and keeps colours where they are wanted."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -43,19 +40,17 @@ class _Harmless:
         if "\x1b" in text and self._stream.isatty() and text.startswith(_CLEAR):
             self._stream.write(_CLEAR)
             text = text[len(_CLEAR) :]
-        has_colours = "\x1b" in text and self._has_colours
-        self._stream.write(printable(text, keeps_colours=has_colours))
+        keeps_colours = False
+        if "\x1b" in text:
+            from neuros.backends.console import wants_colours
+
+            keeps_colours = wants_colours(self._stream, os.environ)
+        self._stream.write(printable(text, keeps_colours=keeps_colours))
         return length
 
     def writelines(self, lines: Iterable[str]) -> None:
         for line in lines:
             self.write(line)
-
-    @property
-    def _has_colours(self) -> bool:
-        from neuros.backends.console import wants_colours
-
-        return wants_colours(self._stream, os.environ)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
