@@ -54,15 +54,6 @@ class TestCauses:
             ("Temporary failure in name resolution", "the package index cannot be reached"),
             ("SSLError(CERTIFICATE_VERIFY_FAILED)", "give your authority's with --ca-bundle"),
             ("E: Could not open lock file - open (13: Permission denied)", "put USER 0 above it"),
-            (
-                "the --mount option requires BuildKit. Refer to https://docs.docker.com/go/buildkit",
-                "the --mount option requires BuildKit. Refer to https://docs.docker.com/go/buildkit:"
-                " unless that is a slip of the pen, it takes a newer BuildKit: install",
-            ),
-            (
-                "Dockerfile parse error line 2: Unknown flag: link",
-                "link: unless that is",
-            ),
         ],
     )
     def test_what_a_user_can_mend_is_one_sentence_with_the_next_step(

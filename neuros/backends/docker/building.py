@@ -1,7 +1,7 @@
-"""Builds the images of recipes with ``docker build``: parents first, what is current not again.
+"""Builds the images of recipes with ``docker build``, parents first; current images stay.
 
-Each image is built under a temporary name, is run once to see that it can run nodes, gets what it
-lacks for that (the recipe ``neuros_python`` on top of it), and its own names last. The program
+Each image is built under a temporary name, and run once to test that it can run nodes. If it
+cannot, the recipe ``neuros_python`` is built on top. It gets its own names last. The program
 ``docker`` chooses the builder: BuildKit where buildx is installed, else the classic one.
 """
 
@@ -56,7 +56,7 @@ from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.progress import Progress
 
 CERTIFICATES = "/tmp/neuros-ca-bundle.pem"
-"""Where a build finds the certificates that the user gives; it is taken away at the end."""
+"""The user's certificates during a build; they are removed at the end."""
 
 _BASE = "neuros.image.base"
 _ARGUMENTS = "neuros.image.arguments"
@@ -69,7 +69,7 @@ _NOTHING: Mapping[str, str] = MappingProxyType({})
 _NO_FILES: Mapping[str, bytes] = MappingProxyType({})
 
 _TEMPORARY = "neuros_building"
-"""The repository of images that are not finished."""
+"""The repository of unfinished images."""
 
 _TAIL_LINES = 12
 _COLOURS = re.compile(r"\x1b\[[0-9;]*m")
@@ -77,7 +77,7 @@ _STEP = re.compile(r"step \d|#\d+ \[", re.IGNORECASE)  # of the classic builder,
 _SHOWN = re.compile(rf"{_STEP.pattern}|(#\d+ [\d.]+ )?\s*(Collecting|Downloading)", re.IGNORECASE)
 _ERROR = re.compile(r"(?:#\d+ [\d.]+ )?(E(?:RROR)?: .*)")
 
-# What a user can mend outside the Dockerfile. The first that fits what was said last tells why.
+# Causes outside the Dockerfile; the first that fits the output counts.
 _CAUSES = (
     (r"no space left on device|\[Errno 28\]", "the disk is full: make room (docker system df)"),
     (
@@ -85,22 +85,16 @@ _CAUSES = (
         "a certificate is not trusted: give your authority's with --ca-bundle FILE",
     ),
     (
-        r"requires BuildKit|dockerfile parse error.*unknown (flag|instruction)"
-        r"|BuildKit is enabled but the buildx component is missing",
-        "{said}: unless that is a slip of the pen, it takes a newer BuildKit: install docker-buildx"
-        " (from docker.com: docker-buildx-plugin; before docker 23: export DOCKER_BUILDKIT=1)",
+        r"(?:Get|Head) \"?https?://([^/\"]+)|lookup (\S+).* no such host",
+        "the registry {} cannot be reached: check the network and the engine's proxy, or name an"
+        " image that the engine has with --base-image",
     ),
     (
-        r"(?:Get|Head) \"?https?://(?P<what>[^/\"]+)|lookup (?P<also>\S+).* no such host",
-        "the registry {what} cannot be reached: check the network and the engine's proxy, or name"
-        " an image that the engine has with --base-image",
-    ),
-    (
-        r"pull access denied for (?P<what>[^\s,]+)|manifest for (?P<also>\S+) not found"
-        r"|(?P<third>\S+): pull access denied, repository does not exist"
-        r"|failed to resolve source metadata for (?P<fourth>\S+):",
-        "there is no image {what} to begin from: correct the FROM line, or name one that the engine"
-        " has with --base-image",
+        r"pull access denied for ([^\s,]+)|manifest for (\S+) not found"
+        r"|(\S+): pull access denied, repository does not exist"
+        r"|failed to resolve source metadata for (\S+):",
+        "there is no image {} to begin from: correct the FROM line, or name one that the engine has"
+        " with --base-image",
     ),
     (
         r"Temporary failure in name resolution|Temporary failure resolving|NewConnectionError"
@@ -116,19 +110,19 @@ _CAUSES = (
 
 
 class Surroundings:
-    """Needs of this machine that all builds share, from its environment and the engine.
+    """Proxies, network, certificates and wheelhouse, which all builds share.
 
-    A wheelhouse leaves proxies out, and packages of the operating system.
+    With a wheelhouse, builds get no proxies and no packages of the operating system.
 
     Args:
-        ca_bundle: a file with certificates to trust besides, PEM.
+        ca_bundle: a file with further certificates, PEM.
         wheels: the address of a wheelhouse, or "".
 
     Attributes:
         arguments: build arguments; the engine keeps proxies out of the images' history.
         network: of the build, ``None`` for the engine's default.
-        files: to lay beside every Dockerfile.
-        lines: to declare in every stage of a Dockerfile.
+        files: for the context of each build.
+        lines: for each stage of a Dockerfile.
     """
 
     def __init__(
@@ -153,10 +147,10 @@ class Surroundings:
 
 @contextlib.contextmanager
 def served(folder: Path) -> Iterator[str]:
-    """Serve a folder of wheels while an image is built without a package index; yields the address.
+    """Serve a folder of wheels to builds without a package index; yields the address.
 
-    The classic builder has no mounts, and what is copied into an image stays in its layers. So pip
-    gets the wheels over HTTP from this machine, while the build uses this machine's network; only
+    The classic builder has no mounts, and copied files stay in the layers of an image. So pip gets
+    the wheels over HTTP from this machine, and the build uses this machine's network. Only
     programs of this machine reach the server.
 
     Raises:
@@ -187,13 +181,13 @@ class _Handler(SimpleHTTPRequestHandler):
 
 
 class ImageBuilder:
-    """Builds images, with a line about each.
+    """Builds images, with a line of progress for each.
 
     Args:
-        logs: the folder for what ``docker build`` prints.
+        logs: the folder for the output of ``docker build``.
         bases: base images by container name, in place of those in the Dockerfiles.
         arguments: build arguments for the Dockerfiles that declare them.
-        pull: whether the newest version of base images is asked for.
+        pull: whether to pull the newest version of base images.
     """
 
     def __init__(
@@ -211,18 +205,18 @@ class ImageBuilder:
         self._logs, self._bases, self._arguments, self._pull = logs, bases, arguments, pull
 
     def build(self, recipes: Iterable[Recipe]) -> None:
-        """Build what is missing or out of date of these and of what they begin from.
+        """Build the missing and outdated images of these recipes and their parents.
 
         Raises:
-            UsageError: for a base image that would not be used; nothing is built then.
-            EnvironmentFault: at the first that cannot be built; those before it are kept.
+            UsageError: for a base image without use; nothing is built then.
+            EnvironmentFault: at the first image that cannot be built; those before it are kept.
         """
         recipes = list(recipes)
         bases: dict[str, str] = {}
         with engine_faults("images cannot be built"):
             for recipe in in_order(recipes):
                 old = built_image(recipe, self._engine)
-                # What the user wanted last time counts again.
+                # The base image of the last time counts again.
                 if old and (base := old.labels.get(_BASE)) and recipe.takes(base):
                     bases[recipe.name] = base
         bases |= self._bases
@@ -246,7 +240,7 @@ class ImageBuilder:
                 self._bring_up_to_date(recipe, bases.get(recipe.name, ""))
 
     def add_to(self, name: str) -> None:
-        """Build, on an image that the user has, one that can run nodes; nothing where it can.
+        """Build an image that can run nodes on an image of the user's, unless that can.
 
         Raises:
             EnvironmentFault: if there is no such image, or it can never run nodes.
@@ -328,9 +322,9 @@ class ImageBuilder:
         self._progress.step(f"{recipe.name}: built in {took_s:.1f} s, {_size(new)}")
 
     def _forget(self, recipe: Recipe, old: Any | None) -> None:
-        """Remove what was built from this folder before, unless somebody uses it.
+        """Remove former images of this folder that are not in use.
 
-        Labels are inherited, so only names that were given here say what is ours.
+        Images on top of ours inherit the labels, so only the names tell ours.
         """
         stale = [
             tag
@@ -353,13 +347,11 @@ def _size(image: Any) -> str:
 
 
 class _Builds:
-    """The builds that one image takes, all with one log.
-
-    As a context manager it takes away the temporary names at the end.
+    """The builds for one image, with one log; its context removes the temporary names.
 
     Args:
         name: of the image, for messages.
-        log: the file for what ``docker build`` prints.
+        log: the file for the output of ``docker build``.
     """
 
     def __init__(
@@ -370,7 +362,7 @@ class _Builds:
         self._temporary: list[str] = []
         self._environ = {**os.environ, "BUILDKIT_PROGRESS": "plain"}
         with contextlib.suppress(EnvironmentFault):
-            # That of a rootless engine is none that the program would find by itself.
+            # The program does not find the socket of a rootless engine by itself.
             self._environ["DOCKER_HOST"] = f"unix://{engine_socket(engine)}"
         log.parent.mkdir(parents=True, exist_ok=True)
         log.unlink(missing_ok=True)
@@ -380,15 +372,13 @@ class _Builds:
 
     def __exit__(self, *_: object) -> None:
         for name in self._temporary:
-            with contextlib.suppress(APIError):  # its build has failed, or it is in use
+            with contextlib.suppress(APIError):  # failed builds, images in use
                 self._engine.images.remove(name, noprune=True)
 
     def build(
         self, folder: Path | None, dockerfile: str, arguments: Mapping[str, str] = _NOTHING
     ) -> str:
-        """Build from the files of ``folder``; returns a temporary name of the image.
-
-        It needs one: what BuildKit begins from has a name.
+        """Build from the files of ``folder``; returns a temporary name, which BuildKit needs.
 
         Raises:
             EnvironmentFault: if it fails.
@@ -408,7 +398,7 @@ class _Builds:
         return name
 
     def able(self, image: str) -> tuple[str, PythonInImage]:
-        """The image itself if it can run nodes, else one with what it lacks on top of it.
+        """The image if it can run nodes, else a new one with the base on top; and its Python.
 
         Raises:
             EnvironmentFault: if it can never run nodes.
@@ -433,7 +423,7 @@ class _Builds:
         return made, python
 
     def finish(self, image: str, tags: Sequence[str], labels: Mapping[str, str]) -> None:
-        """Take away what only the build needed, write the labels, and give it its names."""
+        """Remove the certificates, and add the labels and names."""
         lines = [f"FROM {image}"]
         if self._around.files:
             user = self._engine.images.get(image).attrs["Config"].get("User") or "0"
@@ -452,7 +442,7 @@ class _Builds:
         folder: Path | None = None,
         further: Mapping[str, bytes] = _NO_FILES,
     ) -> None:
-        said: list[str] = []
+        lines: list[str] = []
         with (
             context_of(folder, dockerfile, further) as context,
             self._log.open("a", encoding="utf-8") as log,
@@ -472,17 +462,17 @@ class _Builds:
                     log.write(line)
                     plain = _COLOURS.sub("", line).rstrip()
                     if plain.strip():
-                        said.append(plain)
+                        lines.append(plain)
                     if _SHOWN.match(plain):
                         self._progress.detail(f"{self._name}: {plain.strip()}")
             except BaseException:  # Ctrl+C, above all
                 program.terminate()
                 raise
         if program.returncode:
-            for line in said[-_TAIL_LINES:]:
+            for line in lines[-_TAIL_LINES:]:
                 self._progress.step(f"  {line[:300]}")
             raise EnvironmentFault(
-                f"image '{self._name}' cannot be built: {cause_of(said)} (log: {self._log})"
+                f"image '{self._name}' cannot be built: {cause_of(lines)} (log: {self._log})"
             )
 
 
@@ -492,10 +482,10 @@ def context_of(
 ) -> Iterator[IO[bytes]]:
     """A tar archive with the files of ``folder``, the Dockerfile, and ``further`` files.
 
-    A link becomes the file that it leads to, which may be outside.
+    A link becomes its target, which may be outside.
     """
     with tempfile.TemporaryFile() as archive:
-        # Not every docker can tell an archive from a Dockerfile, but if it is compressed.
+        # Some versions of docker recognise an archive only if it is compressed.
         with tarfile.open(fileobj=archive, mode="w:gz", compresslevel=1, dereference=True) as tar:
             for file in files_of(folder) if folder else ():
                 if file.name != "Dockerfile" or file.parent != folder:
@@ -508,28 +498,27 @@ def context_of(
         yield archive
 
 
-def cause_of(said: Sequence[str]) -> str:
-    """Why a build failed, in a sentence: what a user can do, else the error as it was printed.
+def cause_of(lines: Sequence[str]) -> str:
+    """Why a build failed, in a sentence with a remedy, else the error as it was printed.
 
     Args:
-        said: the lines that ``docker build`` has printed, without colours.
+        lines: the output of ``docker build``, without colours.
     """
-    last = list(said[-40:])
+    last = list(lines[-40:])
     for pattern, sentence in _CAUSES:
         for line in last:
             if match := re.search(pattern, line, re.IGNORECASE):
-                names = [name for name in match.groupdict().values() if name]
-                return sentence.format(what=names[0] if names else "", said=line)
+                return sentence.format(next(filter(None, match.groups()), ""))
     begin = max((at for at, line in enumerate(last) if _STEP.match(line)), default=0)
     errors = (match[1] for line in last[begin:] if (match := _ERROR.match(line)))
     return next(errors, last[-1] if last else "docker build does not say why")
 
 
 def pulled(engine: DockerClient, name: str, *, newest: bool) -> Any:
-    """An image of that name, from its registry where it is not there (or the ``newest`` is wanted).
+    """An image of that name, pulled if the engine lacks it or for the ``newest`` version.
 
     Raises:
-        EnvironmentFault: if it cannot be had.
+        EnvironmentFault: if it cannot be pulled.
     """
     if not newest:
         with contextlib.suppress(APIError):

@@ -1,6 +1,6 @@
-"""Images of containers: finds the one for a node, lists those built by NeuROS, removes them.
+"""Finds the image for a node; lists and removes images that NeuROS has built.
 
-Whether the Python of an image runs nodes is found out by running the image once.
+An image is run once to test whether its Python can run nodes.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ ADDED = "neuros_on"
 """The repository of images that users have, with what nodes need added; tags are their ids."""
 
 
-# Of all Pythons of the image the first with rclpy, else the first. A ROS distribution has to be
-# sourced for that. The proof is rclpy in use: without its middleware it imports nothing either.
+# Prints the facts about each Python of the image. A ROS distribution has to be sourced first. The
+# proof uses rclpy: without its middleware rclpy does not work.
 _PROBE = r"""
 cd /
 for setup in /opt/ros/*/setup.sh; do
@@ -69,11 +69,11 @@ class Image:
     """An image that can run nodes.
 
     Attributes:
-        id: as the engine names it, ``sha256:...``.
+        id: of the engine, ``sha256:...``.
         name: for people.
-        start: how its Python is started: its options follow.
-        python_version: of that Python, as ``(3, 12)``.
-        notice: one sentence if something about it should be said at each launch, else "".
+        start: the command of its Python, without arguments.
+        python_version: as ``(3, 12)``.
+        notice: a sentence for each launch, or "".
     """
 
     id: str
@@ -89,7 +89,7 @@ def images_for(
     """The image of each container.
 
     Raises:
-        EnvironmentFault: with one line for each that has none.
+        EnvironmentFault: with one line for each container without an image.
     """
     found: dict[str, Image] = {}
     faults: list[str] = []
@@ -107,7 +107,7 @@ def image_for(container: str, project_folder: Path | None, engine: DockerClient)
     """The image of a container: the project's own recipe, NeuROS's, or any image of that name.
 
     Raises:
-        EnvironmentFault: if it is not there, is not built, or cannot run nodes.
+        EnvironmentFault: if it is absent, is not built, or cannot run nodes.
     """
     recipe = find_recipe(container, project_folder)
     with engine_faults(f"container '{container}'"):
@@ -143,17 +143,17 @@ def built_image(recipe: Recipe, engine: DockerClient) -> Any | None:
 
 
 def is_current(image: Any, recipe: Recipe) -> bool:
-    """Whether nothing has changed in the recipe since this was built."""
+    """Whether the recipe is still that of the image."""
     return bool(image.labels.get(DIGEST) == recipe.digest)
 
 
 def labels_of_python(python: PythonInImage) -> dict[str, str]:
-    """Labels of a built image that describe its Python, so that it is run only once."""
+    """Labels with the Python of an image, which then needs no second test."""
     return {START: json.dumps(python.start), PYTHON: dotted(python.version)}
 
 
 def added_tag(image: Any) -> str:
-    """The name of what is built on an image of a user's that lacks rclpy."""
+    """The name of the image that is built on a user's image without rclpy."""
     return f"{ADDED}:{str(image.id).removeprefix('sha256:')[:12]}"
 
 
@@ -164,7 +164,7 @@ def _labelled(image: Any, name: str, notice: str = "") -> Image:
 
 
 def _given(container: str, engine: DockerClient) -> Image:
-    """An image that the user has; its own Python is used where that has rclpy."""
+    """A user's image, or the one that was built on it."""
     try:
         image = engine.images.get(container) if _REFERENCE.fullmatch(container) else None
     except (ImageNotFound, APIError) as error:
@@ -194,12 +194,12 @@ class BuiltImage:
     """An image with a name that NeuROS gave it.
 
     Attributes:
-        container: that it is for.
-        tags: its names; those that the user gave are not among them.
-        size_bytes: with everything that it begins from.
+        container: its container.
+        tags: its names, without those that the user gave.
+        size_bytes: with all its layers.
         python: the version, as "3.12".
-        folder: of its recipe, ``None`` where NeuROS's base was put on an image of the user's.
-        is_current: whether it is what the recipe says today.
+        folder: of its recipe, ``None`` if NeuROS's base was built on an image of the user's.
+        is_current: whether its recipe has not changed.
     """
 
     container: str
@@ -211,7 +211,7 @@ class BuiltImage:
 
 
 def inventory(engine: DockerClient) -> list[BuiltImage]:
-    """Everything that NeuROS has built, by container.
+    """All images that NeuROS has built, by container.
 
     Raises:
         EnvironmentFault: if the engine does not answer.
@@ -247,10 +247,10 @@ def inventory(engine: DockerClient) -> list[BuiltImage]:
 
 
 def remove_images(engine: DockerClient, containers: Collection[str]) -> Iterator[str]:
-    """Remove what was built for these containers, or for all if none is named; yields the tags.
+    """Remove the images of these containers, or of all if none is named; yields the tags.
 
     Raises:
-        UsageError: if nothing was built for one of them; all images stay then.
+        UsageError: if one of them has no image; all images stay then.
         EnvironmentFault: if an image is in use.
     """
     images = inventory(engine)
@@ -294,7 +294,10 @@ class PythonInImage:
 
 
 def python_in(engine: DockerClient, image: str, name: str) -> PythonInImage:
-    """Look into an image, by a container that is removed afterwards; ``name`` is for messages.
+    """The Python of an image, found by a container that is then removed.
+
+    Args:
+        name: of the image, for messages.
 
     Raises:
         EnvironmentFault: if it has no Python that could ever run nodes.
@@ -338,7 +341,7 @@ def python_in(engine: DockerClient, image: str, name: str) -> PythonInImage:
 
 
 def chosen(answers: Sequence[Mapping[str, Any]], name: str) -> PythonInImage:
-    """Of what the Pythons of an image say about themselves, the one that nodes would run in.
+    """The Python for nodes, among the facts about the Pythons of an image.
 
     Raises:
         EnvironmentFault: if there is none that could ever run nodes.

@@ -125,8 +125,8 @@ def without_limits(nodes: Sequence[Node], unkept: Collection[str]) -> Sequence[N
 class DockerLauncher:
     """Starts one container per node (:class:`neuros.ports.Launcher`).
 
-    Its reaper hears of the engine, and of the folder that the containers share, before the first
-    of them is made.
+    The reaper gets the engine, and the folder that the containers share, before the first
+    container.
     """
 
     def __init__(self, containers: Containers, program: NodeProgram) -> None:
@@ -218,11 +218,10 @@ class DockerLauncher:
 class RunningContainer:
     """A container with one node (:class:`neuros.ports.RunningNode`).
 
-    Nothing here waits for the engine: it is asked for something in a thread of its own, and the
-    events say what came of it.
+    No method waits for the engine: requests run in a thread, and events tell their effect.
 
     Attributes:
-        id: that the engine has given it.
+        id: of the container.
     """
 
     def __init__(
@@ -233,7 +232,7 @@ class RunningContainer:
         self.id = container_id
         self._engine = engine
         self._events = events
-        self._is_told = False
+        self._is_killed = False
         events.add(container_id)
 
     def poll(self) -> str | None:
@@ -241,7 +240,7 @@ class RunningContainer:
         end = self._events.end_of(self.id)
         if end is not None:
             words = how_it_ended(*end, log_file(self._file), self._file.node.resources.mem_bytes)
-            is_stopped = self._events.fate(self.id).is_signalled and not self._is_told
+            is_stopped = self._events.fate(self.id).is_signalled and not self._is_killed
             return f"{words}: {_STOPPED}" if is_stopped else words
         if self._events.lost and not self._events.pids(self._file.node.name):
             return f"the Docker engine went away ({self._events.lost}): start it again"
@@ -252,20 +251,20 @@ class RunningContainer:
         return bool(self._events.lost) and self._events.end_of(self.id) is None
 
     def kill(self) -> None:
-        self._is_told = True
+        self._is_killed = True
         if self._events.lost:
             self._events.signal_all(signal.SIGKILL, self._file.node.name)
         else:
 
             def tell_engine() -> None:
-                # It may have ended meanwhile; the events say what became of it.
+                # It may have ended meanwhile, which the events tell.
                 with contextlib.suppress(DockerException, requests.RequestException):
                     self._engine.api.kill(self.id)
 
             threading.Thread(target=tell_engine, daemon=True).start()
 
     def threads(self) -> ProcessThreads:
-        """Where its threads stand in Python; the first of its processes may be an init program."""
+        """The Python stacks of its threads; the first of its processes may be an init program."""
         read = ProcessThreads()
         for pid in self._events.pids(self._file.node.name):
             read = threads_of(pid)
@@ -278,7 +277,7 @@ def how_it_ended(exit_code: int, is_out_of_memory: bool, log: Path, mem_bytes: i
     """The end of a container, in words.
 
     Args:
-        log: of the node; its last line says what could not be executed.
+        log: of the node; its last line names a program that could not be executed.
         mem_bytes: its limit of memory, ``None`` if it has none of its own.
     """
     limit = f" (limit {memory_text(mem_bytes)})" if mem_bytes is not None else ""
@@ -314,17 +313,15 @@ class Fate:
 
 
 class ContainerEvents(threading.Thread):
-    """Events of the engine, from before the first container of a run to the end of the last.
+    """Receives the engine's events about the containers of a run, in a thread.
 
-    A thread listens, so that no caller waits for the engine. A container counts as ended when it
-    is gone: then all that the engine has to say of it has come (that memory ran out may follow on
-    the exit code), and nothing of it is left.
+    A container counts as ended when it is removed: then its last event has arrived (that memory
+    ran out may follow on the exit code).
 
-    Where the engine goes away, the nodes are asked to end by themselves (SIGTERM), and judged by
-    their processes from then on.
+    If the engine goes away, the nodes get SIGTERM, and their processes count from then on.
 
     Attributes:
-        lost: why the engine is not heard any more, empty while it is.
+        lost: why the connection to the engine has ended, empty while it lasts.
     """
 
     def __init__(self, engine: DockerClient, run_id: str) -> None:
@@ -341,7 +338,7 @@ class ContainerEvents(threading.Thread):
         )
 
     def run(self) -> None:
-        """Until the end of the last container, :meth:`close`, or the end of the engine."""
+        """Receive until the end of the last container, :meth:`close`, or the end of the engine."""
         reason = "it closed the connection"
         try:
             for event in self._stream:
@@ -365,17 +362,17 @@ class ContainerEvents(threading.Thread):
             self.signal_all(signal.SIGTERM)
 
     def close(self) -> None:
-        """Listen no more."""
+        """End the connection."""
         self._is_closing = True
         with contextlib.suppress(OSError, DockerException):
             self._stream.close()
 
     def add(self, container_id: str) -> None:
-        """Keep listening until the end of this container has been asked for."""
+        """Keep the connection until :meth:`end_of` has told the end of this container."""
         self._awaited.add(container_id)
 
     def end_of(self, container_id: str) -> tuple[int, bool] | None:
-        """The exit code of a container and whether it ran out of memory; ``None`` if it runs on."""
+        """The exit code of a container and whether it ran out of memory; ``None`` while it runs."""
         fate = self.fate(container_id)
         if fate.exit_code is None:
             return None
@@ -387,11 +384,11 @@ class ContainerEvents(threading.Thread):
         return fate.exit_code, fate.is_out_of_memory
 
     def fate(self, container_id: str) -> Fate:
-        """What has happened to a container so far."""
+        """The events of a container so far."""
         return self._fates.setdefault(container_id, Fate())
 
     def pids(self, node: str | None = None) -> Sequence[int]:
-        """Of the processes of a node, or of all, as this machine sees them; the oldest first."""
+        """Process ids of a node, or of all, on this machine; the oldest first."""
         found = RunProcesses(self._run_id).nodes()
         mine = (pid for pid in found if node in (None, found[pid]))
         return sorted(mine, key=lambda pid: started_at(pid) or 0)
