@@ -41,7 +41,7 @@ _MOST_BEHIND_BYTES = 1 << 22
 # A pipe that is ready takes this much without blocking (PIPE_BUF, pipe(7)).
 _READER_IS_GONE = (errno.EPIPE, errno.EIO)  # of a pipe, of a terminal
 _CHUNK_BYTES = 4096
-_LOOK_MS = 50
+_POLL_MS = 50
 _WINDOW_S = 5.0
 """Rates are those of the last few reports, not of the whole run."""
 _BESIDE_TEXT = 18
@@ -51,15 +51,15 @@ _BESIDE_TEXT = 18
 class LogTail:
     """Shows complete lines of several growing files, each in a colour of its own.
 
-    What is new in all files is shown in the order of its records' times; lines without a time stay
-    behind the record that they follow. Of a file that grows faster than it can be shown, a part is
-    left out, and a line says so.
+    New lines of all files are shown in the order of their records' times; a line without a time
+    stays behind the record before it. If a file grows faster than it can be shown, a part is left
+    out, and a line tells that.
 
     Args:
-        files: the name to show, usually the node's, and the file, which need not exist yet.
-        write: takes text of whole lines, with the line feed.
-        colours: whether to colour; if not, colours that nodes write themselves go, too.
-        last_bytes: of what each file has now, begin with so many; ``None``: with all.
+        files: the file of each name, usually a node's; it need not exist yet.
+        write: receives text of whole lines, with the line feed.
+        colours: whether to colour; if not, the nodes' own colours are removed, too.
+        last_bytes: how many bytes of the present content to show; ``None``: all.
     """
 
     def __init__(
@@ -77,15 +77,15 @@ class LogTail:
         self._write = write
 
     def poll(self) -> bool:
-        """Show what is new, at most 64 KiB per file; whether anything was."""
+        """Show new lines, at most 64 KiB per file; returns whether a file has grown."""
         self._show([(file, file.read_lines()) for file in self._files])
         return any(file.has_grown for file in self._files)
 
     def drain(self) -> None:
-        """Show all that is left, incomplete last lines too, and close the files."""
+        """Show the rest, with incomplete last lines, and close the files."""
         while self.poll():
             pass
-        self._show([(file, file.take_rest()) for file in self._files])
+        self._show([(file, file.last_line()) for file in self._files])
         self.close()
 
     def close(self) -> None:
@@ -116,7 +116,7 @@ def format_record(
     """One log record as ROS 2 prints it, without the line feed.
 
     ``time_ns`` is Unix time, now if ``None``. ``layout`` is a value of
-    ``RCUTILS_CONSOLE_OUTPUT_FORMAT``; what it names of source code (file, line) stays empty.
+    ``RCUTILS_CONSOLE_OUTPUT_FORMAT``; its fields for source code (file, line) stay empty.
     """
     at_ns = time.time_ns() if time_ns is None else time_ns
     values = {
@@ -133,10 +133,10 @@ def format_record(
 
 
 def wants_colours(stream: TextIO, environ: Mapping[str, str]) -> bool:
-    """Whether to colour what goes to ``stream``.
+    """Whether to colour text for ``stream``.
 
     ``RCUTILS_COLORIZED_OUTPUT`` (0 or 1) decides, else ``NO_COLOR`` (https://no-color.org), else
-    whether it is a terminal that can.
+    whether it is a terminal with colours.
     """
     told = environ.get("RCUTILS_COLORIZED_OUTPUT")
     if told in ("0", "1"):
@@ -166,7 +166,7 @@ class _GrowingFile:
         return self._last_time_ns
 
     def read_lines(self) -> list[bytes]:
-        """The lines that are complete now, without line feeds."""
+        """New complete lines, without line feeds."""
         data = self._read()
         self.has_grown = bool(data)
         if not data:
@@ -174,13 +174,13 @@ class _GrowingFile:
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(data) == _READ_BYTES:
             lines += self._skip()
-        while len(self._rest) > _LONGEST_LINE_BYTES:  # do not wait for its end
+        while len(self._rest) > _LONGEST_LINE_BYTES:  # show it before its end
             lines.append(self._rest[:_LONGEST_LINE_BYTES])
             self._rest = self._rest[_LONGEST_LINE_BYTES:]
         return lines
 
     def _skip(self) -> list[bytes]:
-        """Leave out most of what is too much to be shown; returns the line that says so."""
+        """Skip to the last 64 KiB of a file that is far ahead; returns a line about that."""
         assert self._descriptor is not None
         at, size = os.lseek(self._descriptor, 0, os.SEEK_CUR), os.fstat(self._descriptor).st_size
         if size - at <= _MOST_BEHIND_BYTES:
@@ -192,7 +192,7 @@ class _GrowingFile:
         left_out = (size - at - len(shown)) / 1e6
         return [f"({left_out:.0f} MB are not shown here; all of it is in {self._path})".encode()]
 
-    def take_rest(self) -> list[bytes]:
+    def last_line(self) -> list[bytes]:
         rest, self._rest = self._rest, b""
         return [rest] if rest else []
 
@@ -216,7 +216,7 @@ class _GrowingFile:
 
 
 class _Painter:
-    """Makes of a line in a log one for the console. No colours where ``palette`` is empty."""
+    """Turns a line of a log into one for the console, without colours if ``palette`` is empty."""
 
     def __init__(self, palette: Mapping[str, str]) -> None:
         self._palette = palette
@@ -241,10 +241,10 @@ class _Painter:
 
 
 def clean(text: str, *, keep_colours: bool) -> str:
-    r"""One line without what could do something to a terminal.
+    r"""One line without effect on a terminal.
 
-    Control sequences go, except colours if they are to stay; other control characters are shown,
-    as ``\x07``. Of a line that was overwritten with carriage returns, the last version stays.
+    Control sequences are removed, except colours with ``keep_colours``; other control characters
+    become text, as ``\x07``. Of a line overwritten by carriage returns, the last version stays.
     """
     if text.isprintable():
         return text
@@ -259,17 +259,17 @@ def clean(text: str, *, keep_colours: bool) -> str:
 
 
 class NonBlockingWriter:
-    """A stream that text can be written to without waiting for its reader.
+    """Writes to a stream without waiting for its reader.
 
-    A terminal that was stopped with Ctrl+S, or a pager at the other end of a pipe, takes nothing
-    for minutes. A launcher that waited for it would miss signals, failures and deadlines. So what
-    does not go through now is kept, and goes later.
+    A terminal that was stopped with Ctrl+S, or a pager behind a pipe, may read nothing for
+    minutes. A launcher that waits for it misses signals, failures and deadlines. So text that the
+    reader does not accept now is kept for later.
 
     A reader that has gone is no error: the run goes on, and its logs are on disk. A stream without
     a file descriptor (in tests) is written to directly.
 
     Attributes:
-        failure: why text was lost, if not because its reader has gone: the disk is full, say.
+        failure: the error that lost text, such as a full disk.
     """
 
     def __init__(self, stream: TextIO | None) -> None:
@@ -285,7 +285,7 @@ class NonBlockingWriter:
 
     @property
     def is_behind(self) -> bool:
-        """Whether there is text that the reader has not taken."""
+        """Whether text waits for the reader."""
         return bool(self._unwritten)
 
     def write(self, text: str) -> None:
@@ -300,7 +300,7 @@ class NonBlockingWriter:
         self.flush()
 
     def flush(self) -> None:
-        """Write what the reader takes now."""
+        """Write the text that the reader accepts now."""
         try:
             while self._unwritten and self._poll.poll(0):
                 assert self._descriptor is not None
@@ -316,7 +316,7 @@ class NonBlockingWriter:
     def finish(self, is_enough: Callable[[], bool], patience_s: float | None = None) -> None:
         """Wait until all is written, or until ``is_enough()``.
 
-        ``patience_s`` is how long to wait for a reader that takes nothing, ``None``: for ever.
+        ``patience_s`` is how long to wait for a reader that does not read; ``None``: for ever.
         """
         last_progress_s, left = time.monotonic(), len(self._unwritten)
         while self._unwritten:
@@ -327,7 +327,7 @@ class NonBlockingWriter:
             if is_enough() or (patience_s is not None and waited_s > patience_s):
                 self._give_up()
             elif self._unwritten:
-                self._poll.poll(_LOOK_MS)
+                self._poll.poll(_POLL_MS)
 
     def _give_up(self) -> None:
         self._is_gone = True
@@ -348,7 +348,7 @@ def _descriptor(stream: TextIO | None) -> int | None:
 
 
 class Reported(Protocol):
-    """Reports of a run that goes on."""
+    """Reports of a run in progress."""
 
     @property
     def reports(self) -> Mapping[str, Report]: ...
@@ -370,12 +370,11 @@ class _Reading(NamedTuple):
 
 
 class Progress:
-    """Reads the reports of a run.
+    """Progress of a run, read from its reports.
 
     Args:
-        outcome: where they are.
-        wall_s, sim_s: how long the run is to last, as far as that is known: a node may tell it
-            (``node.expect_end``).
+        outcome: has the reports.
+        wall_s, sim_s: the length of the run, if known; a node may tell it (``node.expect_end``).
         clock: monotonic, seconds.
     """
 
@@ -394,16 +393,16 @@ class Progress:
 
     @property
     def has_end(self) -> bool:
-        """Whether it is known when the run ends."""
+        """Whether the end of the run is known."""
         return self._wall_s is not None or self._end_sim_s is not None
 
     def text(self) -> str:
-        """Everything in words; empty before the first hook has started."""
+        """All figures in words; empty before the first hook has started."""
         now = self._read()
         return "" if now is None else ", ".join([self._how_far(now), *self._figures(now)])
 
     def bar(self, columns: int, *, is_ascii: bool) -> str:
-        """The line with a bar, where an end is known; never wider than a terminal."""
+        """One line, with a bar if an end is known; at most ``columns - 1`` wide."""
         from tqdm.std import tqdm
 
         now = self._read()
@@ -419,7 +418,7 @@ class Progress:
         while len(parts) > 2 and len(", ".join(parts)) > columns - _BESIDE_TEXT:
             del parts[-2]  # the last is the time that is left
         text = ", ".join(parts)
-        # What tqdm makes of n and total is a bar and a percentage; the rest is ours.
+        # tqdm formats the bar and the percentage.
         layout = "{percentage:3.0f}%|{bar}| " + text
         line: str = tqdm.format_meter(
             share, 1.0, 1.0, ncols=columns - 1, bar_format=layout, ascii=is_ascii
@@ -434,7 +433,7 @@ class Progress:
         return max((end for end in ends if end is not None), default=None)
 
     def _read(self) -> _Reading | None:
-        """What the reports say now, and kept for the rates."""
+        """Sample the reports; the samples of the last seconds are kept for the rates."""
         if self._outcome.started_s is None:
             return None
         reports = self._outcome.reports.values()
@@ -476,7 +475,12 @@ class Progress:
             figures = ["paused"]
         figures.append(f"{now.discarded} discarded")
         left_s = self._left_s(now, factor)
-        return figures if left_s is None else [*figures, f"{_duration(left_s)} left"]
+        if left_s is None:
+            return figures
+        minutes, seconds = divmod(round(left_s), 60)
+        hours, minutes = divmod(minutes, 60)
+        left = f"{hours}:{minutes:02}:{seconds:02}" if hours else f"{minutes}:{seconds:02}"
+        return [*figures, f"{left} left"]
 
     def _left_s(self, now: _Reading, factor: float | None) -> float | None:
         if self._wall_s is not None:
@@ -488,9 +492,3 @@ class Progress:
 
     def _elapsed_s(self, now: _Reading) -> float:
         return now.wall_s - (self._outcome.started_s or now.wall_s)
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -27,7 +27,7 @@ from neuros.stacks import ProcessThreads, threads_of
 
 
 class Processes(BackEnd):
-    """A process per node; what ``auto`` takes where nothing better is usable."""
+    """A process per node; the last choice of ``auto``."""
 
     name = "process"
     place = "a process"
@@ -40,7 +40,7 @@ class Processes(BackEnd):
 
 
 class OneProcess(BackEnd):
-    """One process for all nodes; it runs where somebody asks for it."""
+    """One process for all nodes; only by request."""
 
     name = "in-process"
     place = "one process with all others"
@@ -60,7 +60,7 @@ IN_PROCESS = OneProcess()
 
 
 class ProcessDeployment(Deployment):
-    """Processes of this machine, which keep to no limits."""
+    """Processes of this machine, without limits of resources."""
 
     def __init__(self, nodes: Sequence[Node]) -> None:
         limited = [node.name for node in nodes if any(vars(node.resources).values())]
@@ -84,7 +84,7 @@ class ProcessLauncher:
     """Starts one node process per node (:class:`neuros.ports.Launcher`).
 
     Args:
-        process_of: what to start for a node, with the environment of the run.
+        process_of: the process of a node in the environment of the run.
     """
 
     def __init__(self, program: NodeProgram, process_of: ProcessOf = node_process) -> None:
@@ -118,8 +118,8 @@ class ProcessLauncher:
 class InProcessLauncher(ProcessLauncher):
     """Starts one node process for all nodes.
 
-    It gives each node its own environment and its own log; what does not come from a node
-    goes to ``host.log`` in the run folder.
+    It gives each node its own environment and its own log; other output goes to ``host.log`` in
+    the run folder.
     """
 
     def _processes(
@@ -138,7 +138,7 @@ class RunningProcess:
     is_abandoned = False
 
     def __init__(self, process: NodeProcess, reaper: Reaper) -> None:
-        """Start it; raises ``EnvironmentFault`` if that is impossible."""
+        """Start the process. Raises ``EnvironmentFault``."""
         self.names = process.names
         self._log = process.log
         try:
@@ -163,7 +163,7 @@ class RunningProcess:
         return (script_failure(self._log) if code == 1 else None) or f"exit code {code}"
 
     def wait(self, timeout_s: float) -> str | None:
-        """As :meth:`poll`, after it has ended or ``timeout_s`` seconds have passed."""
+        """Wait for its end, at most ``timeout_s`` seconds; returns as :meth:`poll`."""
         self._process.wait(timeout_s)
         return self.poll()
 
@@ -176,7 +176,7 @@ class RunningProcess:
         self._process.send_signal(signal.SIGKILL, is_for_group=True)
 
     def threads(self) -> ProcessThreads:
-        """Where its threads stand in Python."""
+        """The Python stacks of its threads."""
         read = threads_of(self.pid)
         return read if self.poll() is None else ProcessThreads()
 

@@ -1,8 +1,8 @@
 """Runs on this machine that this user may see: its own, or all for root.
 
-Each run has a reaper from before its first process until after its last: where a reaper is,
-there is a run. So nothing is written down that could be out of date; what the reaper guards
-stands in its environment, which only its user can read.
+Each run has a reaper from before its first process until after its last, so the reapers tell the
+runs, and no file can be out of date. The environment of a reaper describes its run; only its user
+can read that.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _VARIABLE = "NEUROS_GUARDED_RUN"
 
 @dataclass(frozen=True)
 class Session:
-    """A run, as its launcher described it.
+    """A run, described by its launcher.
 
     Attributes:
         run: its id.
@@ -35,11 +35,11 @@ class Session:
         namespace: of its nodes on the ROS graph, empty or as in ``/left``.
         is_one_process: whether its nodes share a process.
         since: Unix time, in seconds.
-        launcher: process id, and when that process started (clock ticks since boot): later
-            processes may have the same number.
+        launcher: process id and start (clock ticks since boot): a later process may have the
+            same number.
         control: address of its control channel.
         elsewhere: the machine of each node that runs on another one.
-        user: number of the user whose run it is: that of its reaper, whatever that says.
+        user: number of the user, which is that of the reaper.
     """
 
     run: str
@@ -62,7 +62,7 @@ class Session:
 
     @property
     def is_led(self) -> bool:
-        """Whether its launcher is there; if not, the reaper is about to end it."""
+        """Whether its launcher runs; if not, the reaper is ending the run."""
         pid, start = self.launcher
         return started_at(pid) == start and _user_of(pid) == self.user
 
@@ -73,14 +73,14 @@ class Session:
         if self.is_one_process and processes.alive():
             there = set(self.nodes)
         up = "running" if self.is_led else "ending"
-        there.update(self.elsewhere)  # a run whose launcher does not hear of one of them ends
+        there.update(self.elsewhere)  # a run ends if its launcher loses one of them
         return {node: up if node in there else "not running" for node in self.nodes}
 
     def interrupt(self) -> None:
         """Ask its launcher to end it, as Ctrl+C does.
 
-        Over its control channel: where a Python program has started it, a signal would reach that
-        program, which may do something else meanwhile. A signal where there is no channel yet.
+        The request goes over the control channel, since the launcher may be a Python program with
+        other work; a signal does where there is no channel yet.
         """
         if not self.is_led:
             return
@@ -90,18 +90,18 @@ class Session:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(self.launcher[0], signal.SIGINT)
         else:
-            link.send(Watch())  # what observers ask for is heard of those that have greeted
+            link.send(Watch())  # requests count after a greeting
             link.send(Interrupt())
             link.close()
 
 
 def reaper_environment(session: Session) -> dict[str, str]:
-    """Environment that marks a reaper as that of a run."""
+    """Environment of the reaper of a run."""
     return {_VARIABLE: json.dumps(asdict(session))}
 
 
 def this_process() -> tuple[int, int]:
-    """The number of this process, and when it started."""
+    """Process id and start of this process, in clock ticks since boot."""
     return os.getpid(), started_at(os.getpid()) or 0
 
 
@@ -118,28 +118,20 @@ def _found() -> Iterator[Session]:
                 # Another version of NeuROS, or another user, may have written anything there.
                 with contextlib.suppress(ControlError, ValueError, TypeError, RecursionError):
                     described = json.loads(variable.removeprefix(mark))
-                    yield _session({**described, "user": _user_of(int(name))})
+                    described |= {"user": _user_of(int(name))}
+                    yield read_as(Session, _harmless(described))
 
 
 def _user_of(pid: int) -> int | None:
-    """The number of the user of a process, ``None`` if it has gone."""
+    """The number of the user of a process, ``None`` if it has ended."""
     try:
         return os.stat(f"/proc/{pid}").st_uid
     except FileNotFoundError:
         return None
 
 
-def _session(described: Mapping[str, Any]) -> Session:
-    """The run that a reaper's environment describes, as it can be shown in a terminal.
-
-    Raises:
-        ControlError: if something lacks, or is of a wrong type.
-    """
-    return read_as(Session, _harmless(described))
-
-
 def _harmless(value: Any) -> Any:
-    """A value whose texts do nothing to a terminal."""
+    """A value whose texts have no effect on a terminal."""
     if isinstance(value, str):
         return clean(value, keep_colours=False)
     if isinstance(value, dict):

@@ -18,10 +18,10 @@ from neuros.errors import EnvironmentFault
 from neuros.ordinary_files import open_log
 
 END = b"end\n"
-"""What the recorder is told when nothing more will come."""
+"""Tells the recorder that no more packets come."""
 
 _NICENESS = 10
-_LOOK_S = 0.1
+_POLL_S = 0.1
 
 
 def start_sidecar(
@@ -36,13 +36,13 @@ def start_sidecar(
     """Start a program beside a run, in a session of its own, at lower priority than nodes.
 
     Its current folder is ``/``: nodes may write to the run folder, and Python may import from the
-    current one.
+    current folder.
 
     Args:
         what: its name, for messages.
-        log: where its standard error goes; input and output are pipes.
-        environment: what is added to that of this process.
-        is_ours: whether it is a program of this Python; others do not get the libraries of ours.
+        log: receives its standard error; input and output are pipes.
+        environment: is added to that of this process.
+        is_ours: whether this Python runs it, with its libraries.
 
     Raises:
         EnvironmentFault: if it cannot be started.
@@ -62,7 +62,7 @@ def start_sidecar(
             )
     except OSError as error:
         raise EnvironmentFault(f"the {what} cannot be started: {error}") from error
-    with contextlib.suppress(OSError):  # it has a lower one already, which only root may raise
+    with contextlib.suppress(OSError):  # only root may raise a lower priority
         os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
     return process
 
@@ -79,8 +79,8 @@ class RecorderProcess:
     """Runs the recorder of a run.
 
     Args:
-        command: the program; started again, it completes what it has left before.
-        environment: what is added to that of this process.
+        command: the program; a second start completes the bag of the first.
+        environment: is added to that of this process.
 
     Raises:
         EnvironmentFault: if it cannot be started.
@@ -101,10 +101,10 @@ class RecorderProcess:
         return self._process.pid
 
     def finish(self, is_given_up: Callable[[], bool]) -> Recorded:
-        """Have it put the last packets into the bag, however long that takes.
+        """Wait until the last packets are in the bag.
 
         Args:
-            is_given_up: asked again and again whether the user gives up waiting.
+            is_given_up: tells whether the user gives up waiting.
         """
         recorded = self._finish(is_given_up)
         if recorded is None and not is_given_up():  # killed, or it has failed
@@ -120,15 +120,15 @@ class RecorderProcess:
         return recorded
 
     def _start(self) -> subprocess.Popen[bytes]:
-        # The nodes come first: what the recorder has not got to waits for it on the disk.
+        # Nodes have priority: packets wait for the recorder on the disk.
         return start_sidecar("recorder", self._command, self._log, self._environment)
 
     def _finish(self, is_given_up: Callable[[], bool]) -> Recorded | None:
-        """Its last report, ``None`` if it makes none."""
+        """Its last report, ``None`` without one."""
         told: bytes | None = END
         while True:
             try:
-                answer, _ = self._process.communicate(told, _LOOK_S)
+                answer, _ = self._process.communicate(told, _POLL_S)
                 break
             except subprocess.TimeoutExpired:
                 told = None

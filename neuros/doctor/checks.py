@@ -1,8 +1,8 @@
-"""Report of ``neuros doctor``: what this machine has, what back ends find, and proof of delivery.
+"""Report of ``neuros doctor``: this machine, its back ends, and a proof of delivery.
 
-The proof is a project of two nodes, run as any other. That nodes see each other's topics proves
-nothing: shared memory that is not shared loses every packet without a word. So one node sends
-images, the other answers with what it has read in them.
+The proof is a project of two nodes, run as any other. Topics that nodes see prove nothing: shared
+memory that is not shared loses each packet in silence. So one node sends images, and the other
+answers with their content.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ from neuros.stacks import allow_reading, threads_of
 PROJECT = Path(__file__).with_name("delivery")
 SHARED_MEMORY = Path("/dev/shm")
 _LEAST_SHARED_BYTES = 64 * 2**20
-"""What Docker gives a container, too, if it is not asked for more."""
+"""Docker's default for a container, too."""
+_DISPLAYS = ("WAYLAND_DISPLAY", "DISPLAY")
 _GPU_TIMEOUT_S = 10.0
 _DELIVERY_TIMEOUT_S = 60.0
 _RENDERING_TIMEOUT_S = 60.0
@@ -66,7 +67,7 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
 
 
 def _back_ends() -> tuple[list[BackEnd], list[Finding]]:
-    """The back ends that can be loaded, and what is wrong with the others."""
+    """The back ends that can be loaded, and findings about the others."""
     loaded: list[BackEnd] = []
     broken: list[Finding] = []
     try:
@@ -89,8 +90,17 @@ def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
     yield Finding.good("cores", f"{len(usable_cores())} usable")
     yield _shared_memory(SHARED_MEMORY)
     yield _domain(environ)
-    yield _stacks()
-    yield _display(environ)
+    allow_reading()
+    read = threads_of(os.getpid())  # nodes are children of a launcher, as this process is of one
+    if read.threads:
+        yield Finding.good("stacks", "those of nodes that hang can be shown")
+    else:
+        yield Finding.absent("stacks", f"those of nodes that hang cannot be shown: {read.problem}")
+    shown = [f"{name}={environ[name]}" for name in _DISPLAYS if environ.get(name)]
+    if shown:
+        yield Finding.good("display", shown[0])
+    else:
+        yield Finding.absent("display", "none; figures go to files, and viewers do not open")
     yield _gpu()
 
 
@@ -133,22 +143,6 @@ def _domain(environ: Mapping[str, str]) -> Finding:
         return Finding.bad("domain", str(error))
 
 
-def _stacks() -> Finding:
-    """Whether a run can show where a node hangs; nodes are children as this process is one."""
-    allow_reading()
-    read = threads_of(os.getpid())
-    if read.threads:
-        return Finding.good("stacks", "those of nodes that hang can be shown")
-    return Finding.absent("stacks", f"those of nodes that hang cannot be shown: {read.problem}")
-
-
-def _display(environ: Mapping[str, str]) -> Finding:
-    for variable in ("WAYLAND_DISPLAY", "DISPLAY"):
-        if environ.get(variable):
-            return Finding.good("display", f"{variable}={environ[variable]}")
-    return Finding.absent("display", "none; figures go to files, and viewers do not open")
-
-
 def _gpu() -> Finding:
     program = shutil.which("nvidia-smi")
     if program is None:
@@ -164,7 +158,7 @@ def _gpu() -> Finding:
 
 
 def installed(subject: str, distribution: str, remedy: str) -> Finding:
-    """The version of a distribution; it is absent if it is not installed."""
+    """The version of a distribution, or its absence."""
     try:
         return Finding.good(subject, f"{distribution} {metadata.version(distribution)}")
     except metadata.PackageNotFoundError:
@@ -172,7 +166,7 @@ def installed(subject: str, distribution: str, remedy: str) -> Finding:
 
 
 def prove_rendering(environ: Mapping[str, str]) -> Finding:
-    """Render one picture with the OpenGL that simulated cameras would use."""
+    """Render one picture with the OpenGL of simulated cameras."""
     subject = "cameras"
     if find_spec("mujoco") is None:
         return Finding.absent(subject, "not tried without MuJoCo")
@@ -195,8 +189,8 @@ def prove_delivery(
     """Run the project on a back end; it ends by itself when all images have come back.
 
     Args:
-        options: further ones of ``neuros launch``.
-        where: what the finding is about, if not the back end.
+        options: further options of ``neuros launch``.
+        where: subject of the finding, if not the back end.
     """
     subject, name = "delivery", where or backend
     with tempfile.TemporaryDirectory(prefix="neuros-doctor-") as folder:
@@ -237,6 +231,6 @@ def _judge(backend: str, record: dict[str, object]) -> Finding:
 
 
 def _last(output: str) -> str:
-    """What the launcher has said last, which is why it ended."""
+    """The last line of the launcher, which has the reason of its end."""
     rows = [row for row in output.splitlines() if row.strip()]
     return rows[-1] if rows else "it said nothing"

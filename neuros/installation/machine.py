@@ -17,10 +17,10 @@ from neuros.errors import EnvironmentFault
 OLDEST, NEWEST, NEWEST_FOR_NEST = (3, 10), (3, 14), (3, 13)
 
 OPENGL_PACKAGES = "libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri libgles2 libosmesa6"
-"""What Debian and Ubuntu render simulated cameras with, without a display."""
+"""Packages of Debian and Ubuntu that render simulated cameras without a display."""
 _FEDORA_OPENGL = "mesa-libEGL mesa-libGL mesa-dri-drivers libglvnd-gles"
 _OPENGL = {
-    # libEGL makes contexts; what draws in them is another library, one of three.
+    # libEGL makes contexts; one of three other libraries draws in them.
     "egl": (("libEGL.so.1",), ("libOpenGL.so.0", "libGL.so.1", "libGLESv2.so.2")),
     "osmesa": (("libOSMesa.so.8", "libOSMesa.so.6", "libOSMesa.so"),),
 }
@@ -28,12 +28,12 @@ _OPENGL = {
 IN_DOCKER = (
     'docker run --rm -it --platform linux/amd64 -v "$PWD":/neuros -w /neuros python:3.12 bash'
 )
-"""A shell where there are packages; on another processor it is emulated, which takes long."""
+"""A shell where packages exist; another processor emulates it slowly."""
 
 
 @dataclass(frozen=True)
 class Machine:
-    """What decides whether the packages of ROS 2 exist for this Python."""
+    """The facts that decide whether packages of ROS 2 exist for a Python."""
 
     python: tuple[int, int]
     implementation: str
@@ -57,7 +57,7 @@ class Machine:
     def require_support(self) -> None:
         """Raise ``EnvironmentFault`` where no packages can exist.
 
-        Which ones exist for ARM (aarch64), the package index knows when they are installed.
+        For ARM (aarch64) the package index decides at the installation.
         """
         if self.system != "Linux" or self.processor not in ("x86_64", "aarch64"):
             raise EnvironmentFault(
@@ -78,9 +78,9 @@ class Machine:
 
 
 def clean_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """An environment in which the Python of ``.venv`` finds its own packages and no others.
+    """An environment in which the Python of ``.venv`` finds only its own packages.
 
-    A sourced ROS 2, or a parent that runs in a ``.venv`` of its own, would come first otherwise.
+    Otherwise a sourced ROS 2, or the ``.venv`` of a parent, would come first.
     """
     foreign = {"LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE", "AMENT_PREFIX_PATH"}
     foreign |= {"PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "RMW_IMPLEMENTATION"}
@@ -91,7 +91,7 @@ def clean_environment(environment: Mapping[str, str]) -> dict[str, str]:
 def answer_of(
     command: Sequence[str], environ: Mapping[str, str] | None = None, timeout_s: float | None = None
 ) -> subprocess.CompletedProcess[str] | None:
-    """What a program says that gets no input; ``None`` if it cannot be started, or goes on."""
+    """Run a program without input; ``None`` if it cannot be started, or after ``timeout_s``."""
     try:
         return subprocess.run(
             command,
@@ -108,7 +108,7 @@ def answer_of(
 
 
 def explain_missing_library(text: str) -> str:
-    """Add the remedy to a message about a missing shared library; others stay as they are."""
+    """Add the remedy to a message about a missing shared library; return others unchanged."""
     missing = re.search(r"(lib[\w.+-]+): cannot open shared object", text)
     if not missing:
         return text
@@ -130,8 +130,15 @@ def system_install(*, apt: str, dnf: str) -> str:
 
 def offscreen_opengl() -> str:
     """The OpenGL for cameras without a display: ``"egl"``, else ``"osmesa"``, else ``""``."""
+
+    def is_there(name: str) -> bool:
+        try:
+            return bool(ctypes.CDLL(name))
+        except OSError:
+            return False
+
     for backend, needed in _OPENGL.items():
-        if all(any(map(_has_library, names)) for names in needed):
+        if all(any(map(is_there, names)) for names in needed):
             return backend
     return ""
 
@@ -139,14 +146,6 @@ def offscreen_opengl() -> str:
 def install_opengl() -> str:
     """The command that installs what :func:`offscreen_opengl` looks for."""
     return system_install(apt=OPENGL_PACKAGES, dnf=_FEDORA_OPENGL)
-
-
-def _has_library(name: str) -> bool:
-    try:
-        ctypes.CDLL(name)
-    except OSError:
-        return False
-    return True
 
 
 def other_python() -> str:
