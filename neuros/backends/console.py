@@ -72,7 +72,7 @@ class LogTail:
         palette = {
             name: _NODE_COLOURS[index % len(_NODE_COLOURS)] for index, name in enumerate(files)
         }
-        self._painter = _Painter(palette if colours else {})
+        self._palette = palette if colours else {}
         self._files = [_GrowingFile(name, path, last_bytes) for name, path in files.items()]
         self._write = write
 
@@ -101,13 +101,32 @@ class LogTail:
 
     def _show(self, found: list[tuple[_GrowingFile, list[bytes]]]) -> None:
         timed = [
-            (file.time_of(line), f"{self._painter.paint(file.name, line)}\n")
+            (file.time_of(line), f"{self._paint(file.name, line)}\n")
             for file, lines in found
             for line in lines
         ]
         if timed:
             timed.sort(key=lambda pair: pair[0])
             self._write("".join(text for _, text in timed))
+
+    def _paint(self, name: str, line: bytes) -> str:
+        """The line of a log as it appears on the console."""
+        text = clean(line.decode("utf-8", "backslashreplace"), keep_colours=bool(self._palette))
+        record = _RECORD.search(text) if "] [" in text else None
+        if record is None or _CONTROL.sub("", text[: record.start()]):
+            return self._coloured(name, f"[{name}] {text}")
+        # A process may write records of any of its nodes.
+        owner = record["name"] if record["name"] in self._palette else name
+        mark = _SEVERITY_COLOURS.get(record["severity"])
+        if not self._palette or not mark:
+            return self._coloured(owner, text)
+        head = f"[{record['severity']}]"
+        rest = text[record.start() + len(head) :]
+        return f"\x1b[{mark}m{head}{_RESET}{self._coloured(owner, rest)}"
+
+    def _coloured(self, name: str, text: str) -> str:
+        colour = self._palette.get(name)
+        return f"\x1b[{colour}m{text}{_RESET}" if colour else text
 
 
 def format_record(
@@ -167,7 +186,16 @@ class _GrowingFile:
 
     def read_lines(self) -> list[bytes]:
         """New complete lines, without line feeds."""
-        data = self._read()
+        data = b""
+        if not self._is_closed:
+            with contextlib.suppress(OSError):  # it is not there yet, or no file
+                if self._descriptor is None:
+                    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW
+                    self._descriptor = os.open(self._path, flags)
+                    if self._last_bytes is not None:
+                        size = os.fstat(self._descriptor).st_size
+                        os.lseek(self._descriptor, max(0, size - self._last_bytes), os.SEEK_SET)
+                data = os.read(self._descriptor, _READ_BYTES)
         self.has_grown = bool(data)
         if not data:
             return []
@@ -201,43 +229,6 @@ class _GrowingFile:
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
-
-    def _read(self) -> bytes:
-        if self._is_closed:
-            return b""
-        with contextlib.suppress(OSError):  # it is not there yet, or no file
-            if self._descriptor is None:
-                self._descriptor = os.open(self._path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
-                if self._last_bytes is not None:
-                    size = os.fstat(self._descriptor).st_size
-                    os.lseek(self._descriptor, max(0, size - self._last_bytes), os.SEEK_SET)
-            return os.read(self._descriptor, _READ_BYTES)
-        return b""
-
-
-class _Painter:
-    """Turns a line of a log into one for the console, without colours if ``palette`` is empty."""
-
-    def __init__(self, palette: Mapping[str, str]) -> None:
-        self._palette = palette
-
-    def paint(self, name: str, line: bytes) -> str:
-        text = clean(line.decode("utf-8", "backslashreplace"), keep_colours=bool(self._palette))
-        record = _RECORD.search(text) if "] [" in text else None
-        if record is None or _CONTROL.sub("", text[: record.start()]):
-            return self._coloured(name, f"[{name}] {text}")
-        # A process may write records of any of its nodes.
-        owner = record["name"] if record["name"] in self._palette else name
-        mark = _SEVERITY_COLOURS.get(record["severity"])
-        if not self._palette or not mark:
-            return self._coloured(owner, text)
-        head = f"[{record['severity']}]"
-        rest = text[record.start() + len(head) :]
-        return f"\x1b[{mark}m{head}{_RESET}{self._coloured(owner, rest)}"
-
-    def _coloured(self, name: str, text: str) -> str:
-        colour = self._palette.get(name)
-        return f"\x1b[{colour}m{text}{_RESET}" if colour else text
 
 
 def clean(text: str, *, keep_colours: bool) -> str:
@@ -275,7 +266,12 @@ class NonBlockingWriter:
     def __init__(self, stream: TextIO | None) -> None:
         self._stream = stream
         self._encoding = "utf-8" if stream is None else stream.encoding or "utf-8"
-        self._descriptor = _descriptor(stream)
+        self._descriptor: int | None = None
+        if stream is not None:
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+            with contextlib.suppress(OSError, ValueError):
+                self._descriptor = stream.fileno()
         self._is_gone = stream is None
         self.failure: OSError | None = None
         self._unwritten = bytearray()
@@ -334,17 +330,6 @@ class NonBlockingWriter:
         self._unwritten.clear()
         if self._descriptor is not None:
             self._poll.unregister(self._descriptor)
-
-
-def _descriptor(stream: TextIO | None) -> int | None:
-    if stream is None:
-        return None
-    with contextlib.suppress(OSError, ValueError):
-        stream.flush()
-    try:
-        return stream.fileno()
-    except (OSError, ValueError):
-        return None
 
 
 class Reported(Protocol):

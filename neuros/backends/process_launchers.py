@@ -26,7 +26,7 @@ from neuros.project.model import Node, NodeFile, Project
 from neuros.stacks import ProcessThreads, threads_of
 
 
-class Processes(BackEnd):
+class ProcessBackEnd(BackEnd):
     """A process per node; the last choice of ``auto``."""
 
     name = "process"
@@ -39,7 +39,7 @@ class Processes(BackEnd):
         return ProcessDeployment(nodes)
 
 
-class OneProcess(BackEnd):
+class InProcessBackEnd(BackEnd):
     """One process for all nodes; only by request."""
 
     name = "in-process"
@@ -50,13 +50,13 @@ class OneProcess(BackEnd):
     def prepare(
         self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
     ) -> Deployment:
-        return _OneProcess(nodes)
+        return InProcessDeployment(nodes)
 
 
 ProcessOf: TypeAlias = "Callable[[NodeProgram, NodeFile, Mapping[str, str]], NodeProcess]"
 
-PROCESS = Processes()
-IN_PROCESS = OneProcess()
+PROCESS = ProcessBackEnd()
+IN_PROCESS = InProcessBackEnd()
 
 
 class ProcessDeployment(Deployment):
@@ -72,7 +72,9 @@ class ProcessDeployment(Deployment):
         return ProcessLauncher(program)
 
 
-class _OneProcess(ProcessDeployment):
+class InProcessDeployment(ProcessDeployment):
+    """One process of this machine for all nodes."""
+
     def launcher(self, program: NodeProgram) -> Launcher:
         return InProcessLauncher(program)
 

@@ -20,8 +20,8 @@ from pathlib import Path
 from neuros.backends.containers import ContainerFolder, find_container
 from neuros.backends.virtual_environments import (
     HERE,
+    CachedEnvironment,
     Choice,
-    Entry,
     Requirements,
     Version,
     cache_folder,
@@ -131,7 +131,7 @@ def choose_here(container: ContainerFolder, cache: Path) -> Choice:
 
 def _entry(
     container: ContainerFolder, requirements: Requirements, cache: Path, version: Version
-) -> Entry:
+) -> CachedEnvironment:
     # An environment on top of this one is no longer the same when a package here changes. Names of
     # folders hold names and versions, and are quick to list.
     here = [
@@ -146,7 +146,7 @@ def _entry(
     if version == HERE:
         parts += [sys.executable, sys.version, here]
     key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-    return Entry(cache / f"{container.name}-{key[:KEY_LENGTH]}")
+    return CachedEnvironment(cache / f"{container.name}-{key[:KEY_LENGTH]}")
 
 
 class Pythons:
@@ -197,7 +197,7 @@ class Pythons:
         """Record the use of each choice, where the cache can be written."""
         for choice in self._each():
             with contextlib.suppress(OSError):
-                choice.settle()
+                choice.record_use()
 
     def make(self, progress: Progress, run_environment: Mapping[str, str]) -> None:
         """Make missing environments; ``run_environment`` is added to that of pip, uv and venv.
@@ -242,7 +242,7 @@ def require_one_python(nodes: Sequence[Node], project: Path, environ: Mapping[st
         choice = choose_here(container, cache_folder(environ))
         if choice.path == Path(sys.executable):
             with contextlib.suppress(OSError):
-                choice.settle()
+                choice.record_use()
             continue
         which = f"node{'' if len(names) == 1 else 's'} {', '.join(names)}"
         lacks = choice.lacks or unmet(choice.requirements, any_version=container.is_own)

@@ -66,7 +66,7 @@ def cache_folder(environ: Mapping[str, str]) -> Path:
 
 
 @dataclass(frozen=True)
-class Entry(Kept):
+class CachedEnvironment(Kept):
     """One environment, made or not; its log is the output of uv."""
 
     @property
@@ -85,7 +85,7 @@ class Entry(Kept):
         python = self.future_python if os.path.exists(self.folder) else Path(sys.executable)
         return python if os.path.exists(self.stamp) and os.access(python, os.X_OK) else None
 
-    def settle(self) -> None:
+    def record_use(self) -> None:
         """Write the stamp, whose time is that of the last use. Raises ``OSError``."""
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         self.stamp.touch()
@@ -100,7 +100,7 @@ class Entry(Kept):
 def sweep(cache: Path) -> None:
     """Remove environments that were interrupted or that no run has used for a month."""
     oldest_s = time.time() - UNUSED_S
-    for entry in map(Entry, kept_in(cache)):
+    for entry in map(CachedEnvironment, kept_in(cache)):
         with contextlib.suppress(OSError), entry.locked(wait=False) as is_mine:
             if not is_mine:
                 continue
@@ -129,7 +129,7 @@ class Choice:
     container: ContainerFolder
     requirements: Requirements
     version: Version
-    entry: Entry
+    entry: CachedEnvironment
     lacks: tuple[str, ...] = ()
     base: Path | None = None
     notice: str = ""
@@ -146,13 +146,13 @@ class Choice:
             return self.entry.future_python
         return self.entry.python() or Path(sys.executable)
 
-    def settle(self) -> None:
+    def record_use(self) -> None:
         """Record for later starts that the environment, or this very Python, is used.
 
         Raises ``OSError``.
         """
         if self.base is None and (self.entry.python() or not os.path.exists(self.entry.folder)):
-            self.entry.settle()
+            self.entry.record_use()
 
 
 def own_needs() -> list[str]:
@@ -213,7 +213,7 @@ def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]
             raise _fault(choice, why)
         _add_links(choice)
         _install(choice, progress, run_environment)
-        entry.settle()
+        entry.record_use()
     except BaseException:
         entry.remove()
         raise

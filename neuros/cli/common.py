@@ -1,7 +1,7 @@
 """Shared by commands: ``--format json``, and the project that a command names.
 
-``docs/command_line.md`` has the keys of JSON. What reads projects is imported late: ``--help`` and
-completion read this module, too.
+``docs/command_line.md`` has the keys of JSON. Modules that read projects are imported late:
+``--help`` and completion import this one, too.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def add_format(command: argparse.ArgumentParser) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON value: of dataclasses their fields, of enumerations their names."""
+    """Print one JSON value; a dataclass becomes its fields, a member of an enumeration its name."""
     print(json.dumps(value, indent=2, default=_plain), flush=True)
 
 
@@ -50,7 +50,7 @@ def _plain(value: Any) -> Any:
 
 
 def add_project(command: argparse.ArgumentParser, declared_in: type = ProjectOptions) -> None:
-    """Add what names a project, and the options that a dataclass declares."""
+    """Add the project, and the options that a dataclass declares."""
     command.add_argument(
         "project", nargs="?", metavar="PROJECT", help="a file, or a folder with a project.json"
     )
@@ -61,7 +61,7 @@ def add_project(command: argparse.ArgumentParser, declared_in: type = ProjectOpt
 
 
 def project_path(parsed: argparse.Namespace) -> Path:
-    """The project that was named, once.
+    """The path of the project on the command line.
 
     Raises:
         UsageError: if none or two were named.

@@ -26,13 +26,13 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 def make_shown_environments(
     pythons: Pythons, signals: list[int], messages: Messages | None = None
 ) -> int:
-    """Make what is missing, and say so; returns 0, or the exit code of a signal that ended it.
+    """Make missing environments and messages; returns 0, or the exit code of a signal.
 
     Args:
-        signals: those that have been noted so far, to which others are added.
+        signals: the signals so far; further ones are added.
 
     Raises:
-        EnvironmentFault: with all that failed.
+        EnvironmentFault: with all failures.
     """
     for notice in pythons.notices:
         print(f"neuros: {notice}", file=sys.stderr)
@@ -46,16 +46,16 @@ def make_shown_environments(
 
 
 def build_messages(messages: Messages) -> int:
-    """Build message packages; returns 0, or the exit code of a signal that ended it.
+    """Build message packages; returns 0, or the exit code of a signal.
 
     Raises:
-        EnvironmentFault: with what failed.
+        EnvironmentFault: with all failures.
     """
     return make_shown_environments(Pythons({}), [], messages)
 
 
 class _Output(io.TextIOBase):
-    """Standard output. It may be closed: then nothing is written, and no error is raised."""
+    """Standard output, without an error if it is closed."""
 
     def isatty(self) -> bool:
         return os.isatty(1)
@@ -68,7 +68,7 @@ class _Output(io.TextIOBase):
 
 @contextmanager
 def signals_interrupt(signals: list[int]) -> Iterator[None]:
-    """Let what ends a run end this at once, by ``KeyboardInterrupt``."""
+    """Turn signals that end a run into ``KeyboardInterrupt``."""
 
     def interrupt(number: int, _: FrameType | None) -> None:
         signals.append(number)
@@ -86,11 +86,11 @@ def signals_interrupt(signals: list[int]) -> Iterator[None]:
 
 
 def require_messages(file: NodeFile) -> None:
-    """See to it that the packages of a recorded node are there: built anew if they were removed.
+    """Build the message packages of a recorded node anew if they were removed.
 
     Raises:
-        UsageError: if one is gone, and its files are not those of the run any more.
-        EnvironmentFault: if it cannot be built.
+        UsageError: if the files of a removed package have changed since the run.
+        EnvironmentFault: if a package cannot be built.
     """
     missing = [python for python in file.messages if not python.is_dir()]
     if not missing:
@@ -108,7 +108,7 @@ def require_messages(file: NodeFile) -> None:
 
 
 def find_messages_of(run: Path) -> None:
-    """Let this very process find the packages of a run, given its folder or its bag."""
+    """Put the message packages of a run on the path, given its folder or its bag."""
     for folder in (run, run.parent):
         for file in folder.glob("*/node.json"):
             with suppress(OSError, EnvironmentFault):

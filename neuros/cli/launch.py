@@ -1,6 +1,6 @@
 """``neuros launch``: runs with console, signals, and exit code.
 
-What runs projects is imported late: ``--help`` and completion read this module, too.
+Modules that run projects are imported late: ``--help`` and completion import this one, too.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def add_launch(launch: argparse.ArgumentParser) -> None:
 
 
 def prepare_launch(launch: argparse.ArgumentParser, arguments: Sequence[str]) -> None:
-    """Add the options of the back end that the arguments name, and of extensions if they need any.
+    """Add the options of the back end in the arguments, and of extensions if necessary.
 
     For ``--help``, add those of all.
     """
@@ -93,7 +93,7 @@ def _launch(parsed: argparse.Namespace) -> int:
         given = {key: value for key, value in values.items() if value is not None}
         options = replace(options, backend_options=given)
         project, messages = load_with_messages(parsed)
-        # To reach other machines, and to prepare them, may take minutes.
+        # Preparing other machines may take minutes.
         heeding = nullcontext() if options.deployment is None else signals_interrupt(signals)
         try:
             with heeding:
@@ -104,7 +104,7 @@ def _launch(parsed: argparse.Namespace) -> int:
             return _dry_run(plan)
         if ended := make_shown_environments(plan.pythons, signals, messages):
             return ended
-        # Before the run leaves the network: a dashboard listens where the browser is.
+        # A dashboard listens in the network of the browser, which an isolated run leaves below.
         prepared = [
             each.prepare(
                 values_of(each.options, parsed), plan.back_end, is_isolated=options.isolate
@@ -125,14 +125,13 @@ def _launch(parsed: argparse.Namespace) -> int:
 
 
 def _enter_own_network() -> None:
-    """Leave the network of this machine, for good: ``--isolate``.
+    """Enter a Linux network namespace with only loopback, for good: ``--isolate``.
 
-    This process enters a Linux network namespace with loopback alone, and so does all that it
-    starts. An ordinary user gets one with a user namespace, in which everything still belongs to
-    that user; root needs none.
+    Child processes inherit the namespace. An ordinary user needs a user namespace around it, with
+    the same user id; root does not.
 
     Raises:
-        EnvironmentFault: if that is not allowed here, or this process has threads already.
+        EnvironmentFault: if this machine forbids namespaces, or this process has threads already.
     """
     import ctypes
     import fcntl
@@ -183,29 +182,30 @@ def _dry_run(plan: Plan) -> int:
 
 @contextmanager
 def signals_noted() -> Iterator[tuple[list[int], socket.socket]]:
-    """Collect SIGINT and SIGTERM instead of dying of them, until the run is cleaned up.
+    """Collect SIGINT and SIGTERM in place of ending by them, until the run is cleaned up.
 
-    Yields them, and a socket to which a byte goes for each, and whenever a child has ended.
+    Yields the list of signals, and a socket that gets a byte for each, and for each child that has
+    ended.
     """
     noted: list[int] = []
     reader, writer = socket.socketpair()
     writer.setblocking(False)
     numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # else nohup wants it to go on
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup ignores it
         numbers.append(signal.SIGHUP)
     previous = {
         number: signal.signal(number, lambda number, _: noted.append(number)) for number in numbers
     }
     previous[signal.SIGCHLD] = signal.signal(signal.SIGCHLD, lambda *_: None)
     waker = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-    mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)  # launch.py had them wait
+    mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, numbers)  # launch.py has blocked them
     try:
         yield noted, reader
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # all is said: they change nothing more
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)  # the run is over: signals change nothing
         signal.set_wakeup_fd(waker)
         for number, handler in previous.items():
-            # Threads that libraries have started meanwhile (NumPy's) do not have them wait.
+            # Threads of libraries (NumPy) do not block them.
             is_over = signal.SIGINT in mask and number in numbers
             signal.signal(number, signal.SIG_IGN if is_over else handler)
         reader.close()

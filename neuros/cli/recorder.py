@@ -31,13 +31,13 @@ _ORPHANED_S = 4.0
 
 
 def add_recorder(recorder: argparse.ArgumentParser) -> None:
-    """Add the arguments of the program; ``launch`` starts it, not people."""
+    """Add the arguments of the program, which ``launch`` starts."""
     recorder.add_argument("run")
     recorder.set_defaults(command=_run_recorder)
 
 
 def _run_recorder(options: argparse.Namespace) -> int:
-    """Record a run until its launcher says, or is, at its end; or complete its bag."""
+    """Record a run until its launcher ends it or has ended; or complete its bag."""
     run = Path(options.run)
     problems = _Problems()
     counts: dict[str, int] = {}
@@ -60,13 +60,13 @@ def _run_recorder(options: argparse.Namespace) -> int:
 
 
 class _Problems:
-    """What went wrong: for the launcher at the end, and for the log at once."""
+    """Problems, for the log at once and for the launcher at the end."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
 
     def add(self, text: str) -> None:
-        """Note a problem, a sentence. Any thread."""
+        """Add a problem, a sentence. Any thread."""
         self.texts.append(text)
         with contextlib.suppress(OSError):  # the disk of the log may be full, too
             print(f"[ERROR] [{time.time():.9f}] [recorder]: {text}", file=sys.stderr, flush=True)
@@ -76,8 +76,16 @@ def _record(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) -
     with the_only_recorder(run), _listening(run, plan, complain) as unheard:
         recorder = Recorder(plan, run, complain)
         try:
-            while not _is_told_to_end(0.0 if recorder.poll() else _POLL_S, recorder):
-                pass
+            while True:
+                wait_s = 0.0 if recorder.poll() else _POLL_S
+                if not select.select([0], [], [], wait_s)[0]:
+                    continue
+                if os.read(0, len(END)) != END:  # the launcher was killed: nodes may go on
+                    give_up_s = time.monotonic() + _ORPHANED_S
+                    while recorder.is_fed and time.monotonic() < give_up_s:
+                        recorder.poll()
+                        time.sleep(_POLL_S)
+                break
             for topic in unheard():
                 complain(f"{topic} is not recorded: nobody published it")
             recorder.complete()
@@ -88,25 +96,11 @@ def _record(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) -
         return recorder.counts()
 
 
-def _is_told_to_end(wait_s: float, recorder: Recorder) -> bool:
-    """Whether nothing more will come, after ``wait_s`` seconds at most."""
-    readable, _, _ = select.select([0], [], [], wait_s)
-    if not readable:
-        return False
-    if os.read(0, len(END)) == END:
-        return True
-    give_up_s = time.monotonic() + _ORPHANED_S
-    while recorder.is_fed and time.monotonic() < give_up_s:
-        recorder.poll()
-        time.sleep(_POLL_S)
-    return True
-
-
 @contextlib.contextmanager
 def _listening(
     run: Path, plan: RecordingPlan, complain: Callable[[str], object]
 ) -> Iterator[Callable[[], list[str]]]:
-    """Listen in a thread; yields what stops it, and tells which wanted topics had no publisher."""
+    """Record topics of others in a thread; yields its end, which returns the unpublished ones."""
     if not plan.listen:
         yield list
         return

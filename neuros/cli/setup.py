@@ -197,7 +197,7 @@ def _remove_images(options: argparse.Namespace) -> int:
 
 
 def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
-    """The recipes, and the images without one, that are behind names, folders and projects."""
+    """The recipes, and the images without a recipe, of names, folders and projects."""
     from neuros.backends.containers import find_recipe
 
     recipes: list[Recipe] = []
@@ -213,7 +213,7 @@ def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
 
 
 def _containers(name: str) -> list[tuple[str, Path | None]]:
-    """What a name stands for: containers, each with the folder of its project."""
+    """The containers of a name, folder or project, each with the folder of its project."""
     from neuros.api.loading import workspaces_of
     from neuros.backends.containers import names_in
     from neuros.distribution import WORKSPACE
@@ -239,7 +239,7 @@ def _pair(text: str, key: str | None) -> tuple[str, str]:
 
 
 def _file_or_folder(text: str | None, option: str, *, is_folder: bool) -> Path | None:
-    """The path of an option that was given, if there is such a thing."""
+    """The path of an option. Raises ``UsageError`` if it does not exist."""
     if text is None:
         return None
     path = Path(text).absolute()
@@ -307,7 +307,7 @@ def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser, name: str) -> None:
-    """Have the checkout add its options.
+    """Add the options that the checkout defines.
 
     Raises:
         EnvironmentFault: where neuros was installed without a checkout.

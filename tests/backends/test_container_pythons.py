@@ -132,15 +132,15 @@ class TestChoices:
         choice = project.choice("snn")
         assert choice.path == Path(sys.executable)
         assert choice.base is None
-        choice.settle()
+        choice.record_use()
         assert project.choice("snn").path == Path(sys.executable)
 
-    def test_half_an_environment_is_not_settled_as_whole(self, project: Project) -> None:
+    def test_half_an_environment_is_not_recorded_as_whole(self, project: Project) -> None:
         project.container("snn", "jsonschema")
         choice = project.choice("snn")
         choice.entry.future_python.parent.mkdir(parents=True)
         choice.entry.future_python.symlink_to(sys.executable)
-        choice.settle()
+        choice.record_use()
         assert choice.entry.python() is None
 
     def test_what_it_lacks_gets_an_environment_on_top_of_it(self, project: Project) -> None:

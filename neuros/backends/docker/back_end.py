@@ -15,7 +15,7 @@ from neuros.errors import EnvironmentFault
 from neuros.ports import BackEnd, Deployment, Finding
 from neuros.project.model import Folders, Node, NodeFile, Project
 
-# What faults of the engine end with; it is no news where nodes run without containers.
+# The end of the engine's faults; the report of `auto` leaves it out.
 _WITHOUT = ", or run without containers: --backend process"
 
 
@@ -54,7 +54,7 @@ class Docker(BackEnd):
     def place_in(self, record: Mapping[str, Any], node: str) -> str:
         nodes = record["expanded_project"]["nodes"]
         (container,) = (each["container"] for each in nodes if each["name"] == node)
-        engine = record["docker"]  # None where the engine had gone away
+        engine = record["docker"]  # None if the engine had gone away
         return f"image {engine['images'][container]['name'] if engine else container}"
 
     def provenance(self, record: Mapping[str, Any]) -> Mapping[str, str]:
@@ -66,10 +66,10 @@ BACK_END = Docker()
 
 
 def check_modules(nodes: Sequence[Node], project: Path) -> None:
-    """Check that no plugin is a module that its node's container cannot have.
+    """Check that the container of each node can have the module of its plugin.
 
     Raises:
-        EnvironmentFault: with what to write.
+        EnvironmentFault: with the necessary lines.
     """
     for node in nodes:
         container = find_container(node.container, project)
@@ -84,7 +84,7 @@ def check_modules(nodes: Sequence[Node], project: Path) -> None:
 
 
 def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iterator[Finding]:
-    """The engine and, if it answers, the images of containers of NeuROS's own."""
+    """The engine and, if it answers, the images of NeuROS's own containers."""
     if find_spec("docker") is None:
         yield Finding.absent("Docker", "its Python package is not installed", install_command())
         return

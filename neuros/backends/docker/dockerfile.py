@@ -21,9 +21,9 @@ class Instruction:
 
     Attributes:
         name: in capital letters.
-        text: what stands behind the name, on one line; without its heredocs.
+        text: the rest of the instruction on one line, without heredocs.
         first: the number of its first line, from 1.
-        last: the number of its last line, those of heredocs included.
+        last: the number of its last line, with heredocs.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Instruction:
 def instructions(text: str) -> Iterator[Instruction]:
     """The instructions of a Dockerfile, in order."""
     lines = text.splitlines()
-    # Directives for the parser stand above everything else.
+    # Parser directives come before all other lines.
     directives = takewhile(lambda line: re.match(r"#\s*\w+\s*=", line), lines)
     found = (re.match(r"#\s*escape\s*=\s*(\S)", line, re.IGNORECASE) for line in directives)
     escape = next((match[1] for match in found if match), "\\")
@@ -64,10 +64,11 @@ def instructions(text: str) -> Iterator[Instruction]:
 
 
 def images_in(text: str, arguments: Mapping[str, str] = _NOTHING) -> list[str]:
-    """The images that its stages begin from, in order; stages that begin from another are left out.
+    """The images in its ``FROM`` lines, in order, without names of its own stages.
 
-    ``arguments`` are build arguments; they count where the Dockerfile declares them in front of the
-    first ``FROM``, else its own default does.
+    Args:
+        arguments: build arguments; they count if the Dockerfile declares them before its first
+            ``FROM``.
     """
     values: dict[str, str] = {}
     images: list[str] = []
@@ -88,14 +89,14 @@ def images_in(text: str, arguments: Mapping[str, str] = _NOTHING) -> list[str]:
 
 
 def arguments_of(text: str) -> set[str]:
-    """The names of all build arguments that it declares."""
+    """The names of all declared build arguments."""
     return {
         name for each in instructions(text) if each.name == "ARG" for name, _ in _declared(each)
     }
 
 
 def after_each_from(text: str, lines: str) -> str:
-    """The Dockerfile with ``lines`` behind each ``FROM``: they count in all of its stages."""
+    """The Dockerfile with ``lines`` after each ``FROM``, for all stages."""
     ends = {each.last for each in instructions(text) if each.name == "FROM"}
     found = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -104,7 +105,7 @@ def after_each_from(text: str, lines: str) -> str:
 
 
 def on_images(text: str, tags: Mapping[str, str]) -> str:
-    """The Dockerfile with other names for the images that it begins from: ``{name: tag}``."""
+    """The Dockerfile with other images in its ``FROM`` lines: ``{name: tag}``."""
 
     def renamed(match: re.Match[str]) -> str:
         name = match[2].removesuffix(":latest")

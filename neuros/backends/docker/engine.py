@@ -1,4 +1,4 @@
-"""The Docker engine: found as Docker's own tools find it, or one sentence on why there is none."""
+"""The connection to the Docker engine, and its errors in one sentence."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ def connect(
 ) -> DockerClient:
     """Connect to the engine that ``DOCKER_HOST``, the current context, or the usual socket names.
 
-    Where the usual socket does not exist, one of rootless Docker is taken. A single request may
-    last ``timeout_s`` seconds, ``None`` for any time; the caller closes the client.
+    Without the usual socket, that of rootless Docker counts. A single request may last
+    ``timeout_s`` seconds, ``None`` for any time; the caller closes the client.
 
     Raises:
         EnvironmentFault: where there is none, it may not be used, or it is too old.
@@ -55,7 +55,7 @@ def connect(
         if scheme == "unix":  # the operating system's own error says more than the SDK's
             with socket.socket(socket.AF_UNIX) as tried:
                 tried.connect(path)
-        # "auto" asks the engine, so that whatever else is wrong shows here.
+        # "auto" asks the engine, so that all other errors appear here.
         engine = docker.from_env(version="auto", timeout=timeout_s, environment=given)
     except (DockerException, requests.RequestException, OSError, ValueError) as error:
         cause = _cause(error)
@@ -89,8 +89,8 @@ class Abilities:
 
     Attributes:
         is_rootless: whether it runs as an ordinary user, who is root in its containers.
-        unkept: what of :class:`neuros.project.model.Resources` it accepts and does not keep
-            to, since there are no control groups for it.
+        unkept: attributes of :class:`neuros.project.model.Resources` without effect, for lack of
+            control groups.
     """
 
     is_rootless: bool = False
@@ -98,7 +98,7 @@ class Abilities:
 
     @staticmethod
     def of(facts: Mapping[str, Any]) -> Abilities:
-        """Those in the answer of ``docker info``, and of podman, which says it in its own way."""
+        """Read the answer of ``docker info``, or podman's."""
         of_podman = bool(facts.get("Rootless"))
         ignores_all = of_podman and facts.get("CgroupVersion") == "1"
         return Abilities(
@@ -108,10 +108,10 @@ class Abilities:
 
 
 def require_program() -> None:
-    """See to it that there is the program ``docker``, which the engine can do without.
+    """Check that the program ``docker`` exists; an engine can run without it.
 
     Raises:
-        EnvironmentFault: if there is none, with the package that has it.
+        EnvironmentFault: if it is absent, with the package that has it.
     """
     if shutil.which("docker") is None:
         raise EnvironmentFault(
@@ -122,7 +122,7 @@ def require_program() -> None:
 
 @contextmanager
 def engine_faults(doing: str) -> Iterator[None]:
-    """Turn what the Docker SDK raises into ``EnvironmentFault``, which begins with ``doing``."""
+    """Turn errors of the Docker SDK into ``EnvironmentFault``, which begins with ``doing``."""
     try:
         yield
     except APIError as error:
@@ -137,8 +137,8 @@ def engine_socket(engine: DockerClient) -> str:
     """The Unix socket of the engine.
 
     Raises:
-        EnvironmentFault: if it is reached in another way. It may be on another machine then, where
-            the folders of the project and of the run are not.
+        EnvironmentFault: for another kind of address, which may be that of another machine without
+            the folders of project and run.
     """
     path = getattr(engine.api.get_adapter(engine.api.base_url), "socket_path", None)
     if path is None:
@@ -169,7 +169,7 @@ def explain(text: str) -> str:
 
 
 def _cause(error: BaseException) -> OSError | None:
-    """The operating system's error at the bottom of what three libraries have wrapped around it."""
+    """The operating system's error inside the errors of three libraries."""
     to_see: list[Any] = [error]
     while to_see:
         each = to_see.pop()

@@ -1,6 +1,6 @@
-"""Resumes and removes containers of a run whose launcher could not: it was killed, or is ending.
+"""Resumes and removes the containers that a launcher leaves; the reaper runs this.
 
-Speaks the engine's HTTP itself, since the reaper runs this: standard library only.
+It speaks HTTP with the engine itself: the reaper has only the standard library.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ _POLL_S = 0.05
 
 
 def remove(engine_socket: str, run_id: str, *, settle_s: float, give_up_s: float) -> int:
-    """Kill and remove what carries the label of a run, until nothing does; how many are left.
+    """Kill and remove the containers of a run until none is left; returns how many are left.
 
-    ``settle_s``: how long nothing must have been there, since what a killed launcher had asked
-    the engine for may still be on its way. With 0 it had ended by itself; then an engine that is
-    away is not waited for, since all nodes have ended. After ``give_up_s`` seconds it ends in any
-    case.
+    Args:
+        settle_s: how long no container must appear, since requests of a killed launcher may still
+            be under way. 0 means that the launcher ended by itself: all nodes have ended then,
+            and an absent engine is not waited for.
+        give_up_s: end after this time in any case.
     """
     now_s = time.monotonic()
     give_up_at, clean_since = now_s + give_up_s, now_s

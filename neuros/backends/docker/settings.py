@@ -1,10 +1,9 @@
 """Settings of a container, from its node, its image and the user.
 
-By default a container is locked down: the caller's user id and no capability, nothing gained by
-programs with the set-user-id bit, a root file system that cannot be written to, a ``/tmp`` that
-goes with it. It sees the project and the workspace, which it can read, and the run folder, where it
-can write new files and into a folder of its own: what the other nodes and the run itself have there
-it can only read. The paths under which it sees them do not depend on the machine.
+By default a container is locked down: the caller's user id and no capability, no rights from
+set-user-id bits, a read-only root file system, a ``/tmp`` of its own. It can read the project and
+the workspace. In the run folder it can write new files and its node's folder, and only read the
+files of the run and of other nodes. Its paths for these folders are the same on each machine.
 """
 
 from __future__ import annotations
@@ -41,45 +40,45 @@ if TYPE_CHECKING:
 
 ROOT = Path("/neuros")
 FOLDERS = Folders(project=ROOT / "project", workspace=ROOT / "workspace", run=ROOT / "run")
-"""What a node may read and write, as it sees it."""
+"""The folders of a node, as paths in its container."""
 
 MESSAGES = ROOT / "messages"
-"""The built message packages of the run, each in a folder that has the same name here."""
+"""The built message packages of the run, with the folder names of this machine."""
 
 LIBRARY = ROOT / "lib"
-"""What ``PYTHONPATH`` names: NeuROS itself is in there, from the launcher's own installation."""
+"""On ``PYTHONPATH``: NeuROS itself, from the launcher's installation."""
 
 XAUTHORITY = ROOT / "xauthority"
-"""The key to the user's display, where a node has one."""
+"""The key to the user's display, for nodes with a display."""
 
 DDS_FILE = ROOT / "fast_dds.xml"
-"""The user's own settings of Fast DDS, where there are any."""
+"""The user's settings of Fast DDS, if any."""
 
 _INSIDE = re.compile(rf"(?<![\w/.]){ROOT}/({'|'.join(each.name for each in fields(Folders))})\b")
 
-# Discovery stays on this machine, so that nodes have to share its network. Large packets go through
-# shared memory where both ends see the same: the containers of one run do, and see nobody else's.
+# Discovery stays on this machine, so nodes share its network. Large packets go through shared
+# memory, which only the containers of one run share.
 NETWORK_MODE = "host"
 NO_NETWORK = "none"
 IPC_MODE = "private"
 SHARED_MEMORY = Path("/dev/shm")
 
 MOST_PIDS = 4096
-"""Processes and threads of a node that sets no limit: what keeps a fork bomb to its container."""
+"""Processes and threads of a node without a limit: it confines a fork bomb to its container."""
 
 PASSED_ON = (
     *("LANG", "LC_ALL", "TZ", *THREAD_VARIABLES),
     *("MUJOCO_GL", "NEUROS_EXECUTOR", "RCUTILS_CONSOLE_OUTPUT_FORMAT", "ROS_STATIC_PEERS"),
 )
-"""What a container gets of the launcher's environment; the rest of it stays outside."""
+"""The variables of the launcher's environment that a container gets."""
 
-# Fast DDS reads settings of the user's own from the file that this names.
+# Names a file with the user's settings of Fast DDS.
 DDS_SETTINGS = "FASTRTPS_DEFAULT_PROFILES_FILE"
 
 X11 = Path("/tmp/.X11-unix")
 _TMP = "rw,exec,nosuid,nodev,size=1g,mode=1777"
-# What the engine keeps (`docker logs`) says where the rest is: the node writes its log itself, so
-# that nothing passes through the engine, and nothing is lost when that or the launcher dies.
+# `docker logs` shows where the log is: the node writes it itself, so that no output passes through
+# the engine, and none is lost when the engine or the launcher dies.
 _START = 'echo "the output of this node is in $1"; log=$0; shift; exec "$@" >>"$log" 2>&1'
 
 
@@ -98,12 +97,12 @@ def container_settings(
 
     Args:
         file: the node with the paths of this machine.
-        environment: what the run adds to that of each node.
-        others: what is in the run folder and not the node's own; it can only read that.
-        launcher_pid: said in a label.
+        environment: that the run adds to that of each node.
+        others: entries of the run folder that the node can only read.
+        launcher_pid: for a label.
         network: that of this machine, none, or that of another container.
-        is_rootless: whether the engine is, which calls its user root in containers, with no more
-            rights.
+        is_rootless: whether the engine is rootless: it names its user root in containers, without
+            further rights.
 
     Raises:
         EnvironmentFault: if a device of the node, or a file with settings of DDS, is not there.
@@ -114,8 +113,8 @@ def container_settings(
         **DEFAULTS,
         **{key: environ[key] for key in PASSED_ON if key in environ},
         "HOME": "/tmp",
-        "XDG_CACHE_HOME": "/tmp/.cache",  # for libraries that go by the user's entry instead
-        "USER": "neuros",  # for programs that ask who they are: the id has no name in the image
+        "XDG_CACHE_HOME": "/tmp/.cache",  # for libraries that read the user's entry instead
+        "USER": "neuros",  # the user id has no name in the image
         **(thread_limits([node]) if cores else {}),
         **node_environment(seen),
         **environment,
@@ -129,7 +128,7 @@ def container_settings(
         *(mount(folder, LIBRARY / name) for name, folder in libraries().items()),
         mount(file.folders.project, FOLDERS.project),
         mount(file.folders.run, FOLDERS.run, read_only=False),
-        # In a folder that it may write to; but what it was told stays as it was.
+        # The node may write to the folder of this file, but not to the file.
         mount(own, node_folder(seen) / own.name),
         *(mount(path, FOLDERS.run / path.relative_to(file.folders.run)) for path in others),
         mount(shared_memory(run_id), SHARED_MEMORY, read_only=False),
@@ -200,11 +199,11 @@ def container_settings(
 
 
 def limits(node: Node) -> dict[str, Any]:
-    """Arguments of ``docker.containers.create``: what a node may take, and its devices."""
+    """Arguments of ``docker.containers.create`` for the limits and devices of a node."""
     resources = node.resources
     settings: dict[str, Any] = {"pids_limit": resources.pids or MOST_PIDS}
     if resources.mem_bytes is not None:
-        # Without swap: a node that pages is no better than one that has ended, and does not say so.
+        # Without swap: a node that pages is as bad as one that has ended, and harder to notice.
         settings |= {"mem_limit": resources.mem_bytes, "memswap_limit": resources.mem_bytes}
     if resources.cpus is not None:
         settings["nano_cpus"] = int(resources.cpus * 1e9)
@@ -218,7 +217,7 @@ def limits(node: Node) -> dict[str, Any]:
 
 
 def container_name(file: NodeFile, run_id: str) -> str:
-    """The name of a container: unique, and to be recognised in ``docker ps``."""
+    """The unique name of a container."""
     return f"neuros-{file.node.name}-{run_id[:8]}"
 
 
@@ -228,12 +227,12 @@ def shared_memory(run_id: str) -> Path:
 
 
 def mount(here: Path, there: Path, *, read_only: bool = True) -> dict[str, Any]:
-    """A folder or file of this machine, as a container sees it."""
+    """The mount of a folder or file of this machine in a container."""
     return {"Type": "bind", "Source": str(here), "Target": str(there), "ReadOnly": read_only}
 
 
 def inside(file: NodeFile) -> NodeFile:
-    """A node with all paths as it sees them in its container; what it does not see stays."""
+    """A node with the paths of its container; paths without a mount stay."""
     here = file.folders
     places = [(here.project, FOLDERS.project), (here.workspace, FOLDERS.workspace)]
     places += [(python.parent, MESSAGES / python.parent.name) for python in file.messages]
@@ -246,7 +245,7 @@ def inside(file: NodeFile) -> NodeFile:
 
 
 def outside(file: NodeFile, folders: Folders, messages: Path = MESSAGES) -> NodeFile:
-    """The inverse of :func:`inside`: the node with the paths of a machine with these folders.
+    """The inverse of :func:`inside`: a node with the paths of a machine with these folders.
 
     Args:
         messages: the folder with built message packages.
