@@ -35,7 +35,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -70,7 +70,11 @@ def sweep(
         time.sleep(look_again_s)
         now = _are_held(folder, started_s)
         for files in [each for each in now if not now[each] and looks[-1].get(each) is False]:
-            removed += _remove(folder, files)
+            for name, inode in files:
+                with contextlib.suppress(OSError):
+                    if os.lstat(folder / name).st_ino == inode:
+                        os.unlink(folder / name)
+                        removed.append(name)
             del now[files]
         looks.append(now)
         if all(look.get(files) for files in now for look in looks[-3:]) and len(looks) >= 3:
@@ -130,14 +134,6 @@ def _groups(folder: Path) -> Mapping[str, _Found]:
                 if match and match["part"] in _LOCKS:
                     group.locks.append(name)
     return found
-
-
-def _remove(folder: Path, files: Iterable[tuple[str, int]]) -> Iterator[str]:
-    for name, inode in files:
-        with contextlib.suppress(OSError):
-            if os.lstat(folder / name).st_ino == inode:
-                os.unlink(folder / name)
-                yield name
 
 
 def hold(folder: Path) -> int:

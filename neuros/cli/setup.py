@@ -6,7 +6,6 @@ import argparse
 import importlib
 import os
 import sys
-from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from itertools import chain
 from pathlib import Path
@@ -130,13 +129,21 @@ def add_containers(containers: argparse.ArgumentParser) -> None:
 
 
 def _build_images(options: argparse.Namespace) -> int:
+    from neuros.backends.containers import find_recipe
     from neuros.backends.docker.building import ImageBuilder, Surroundings, served
     from neuros.backends.docker.engine import connect, require_program
     from neuros.installation.progress import Progress
 
     bases = dict(_pair(text, "neuros_python") for text in options.base_image)
     arguments = dict(_pair(text, None) for text in options.build_arg)
-    recipes, images = _wanted(options.names or STANDARD)
+    recipes: list[Recipe] = []
+    images: list[str] = []  # without a recipe
+    for name in options.names or STANDARD:
+        for container, project_folder in _containers(name):
+            if recipe := find_recipe(container, project_folder):
+                recipes.append(recipe)
+            elif container not in images:
+                images.append(container)
     wheelhouse = _file_or_folder(options.wheelhouse, "--wheelhouse", is_folder=True)
     bundle = _file_or_folder(options.ca_bundle, "--ca-bundle", is_folder=False)
     with ExitStack() as stack:
@@ -194,22 +201,6 @@ def _remove_images(options: argparse.Namespace) -> int:
     if not has_removed:
         print("NeuROS has built no images: there is nothing to remove")
     return 0
-
-
-def _wanted(names: Sequence[str]) -> tuple[list[Recipe], list[str]]:
-    """The recipes, and the images without a recipe, of names, folders and projects."""
-    from neuros.backends.containers import find_recipe
-
-    recipes: list[Recipe] = []
-    images: list[str] = []
-    for name in names:
-        for container, project_folder in _containers(name):
-            recipe = find_recipe(container, project_folder)
-            if recipe:
-                recipes.append(recipe)
-            else:
-                images.append(container)
-    return recipes, list(dict.fromkeys(images))
 
 
 def _containers(name: str) -> list[tuple[str, Path | None]]:
