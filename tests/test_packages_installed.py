@@ -269,11 +269,14 @@ class TestInstaller:
         assert not is_installed(python)
         assert "No space left" in (python.parent.parent / "log").read_text("utf-8")
 
-    def test_uv_gets_the_settings_of_pip(self, python: Path, environ: dict[str, str]) -> None:
-        program(python.with_name("uv"), 'echo "$@" "[$UV_NO_INDEX $UV_FIND_LINKS]"')
-        self.run(python, environ)
+    @pytest.mark.parametrize(("no_index", "option"), [("1", " --no-index"), ("false", "")])
+    def test_uv_gets_the_settings_of_pip(
+        self, python: Path, environ: dict[str, str], no_index: str, option: str
+    ) -> None:
+        program(python.with_name("uv"), 'echo "$@" "[$UV_FIND_LINKS]"')
+        self.run(python, {**environ, "PIP_NO_INDEX": no_index})
         log = (python.parent.parent / "log").read_text("utf-8")
-        assert f"--python {python} neuros_colour [1 {environ['PIP_FIND_LINKS']}]" in log
+        assert f"--python {python}{option} neuros_colour [{environ['PIP_FIND_LINKS']}]" in log
 
     @pytest.mark.parametrize(("set_to", "is_told"), [(None, "1"), ("0", "0")])
     def test_modules_are_compiled_unless_the_user_tells_uv_not_to(

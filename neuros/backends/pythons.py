@@ -83,6 +83,8 @@ def find_python(version: Version, environ: Mapping[str, str]) -> Path | None:
     for installations in (pyenv, uv):
         candidates += sorted(installations.glob(f"*/bin/{name}"), reverse=True)
     for path in candidates:
+        if not os.access(path, os.X_OK):
+            continue
         command = [str(path), "-I", "-S", "-c", _ASK]
         answer = answer_of(command, clean_environment(environ), _ANSWER_TIMEOUT_S)
         if answer and answer.stdout.split() == ["cpython", *map(str, version)]:

@@ -203,10 +203,11 @@ class Installer:
         pip = python_command("pip", "config", "list", python=self.python)
         listing = answer_of(pip, self.environ)
         environ = uv_environment(listing.stdout if listing else "", self.environ)
-        uv = str(self.require_uv())
-        return self._run(
-            [uv, *_UV_INSTALL, "--python", str(python or self.python), *arguments], environ
-        )
+        command = [str(self.require_uv()), *_UV_INSTALL, "--python", str(python or self.python)]
+        # uv has this variable as an option only.
+        if environ.get("UV_NO_INDEX", "0").lower() not in ("0", "no", "off", "false"):
+            command.append("--no-index")
+        return self._run([*command, *arguments], environ)
 
     def _run(self, command: Sequence[str], environ: Mapping[str, str]) -> str:
         """Run pip or uv, show what it does, and return what it wrote."""
