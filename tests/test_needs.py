@@ -34,8 +34,9 @@ def test_three():
 @pytest.fixture
 def tests(tmp_path: Path) -> Path:
     """A folder with tests that need what is not there, under this project's ``conftest.py``."""
-    for name in ("conftest.py", "marking.py", "needs.py"):
-        shutil.copy(Path(__file__).parent / name, tmp_path)
+    here = Path(__file__).parent
+    for file in (here.parent / "conftest.py", here / "support/marking.py", here / "needs.py"):
+        shutil.copy(file, tmp_path)
     (tmp_path / "needs.py").write_text(
         Path(needs.__file__).read_text().replace("__file__", repr(needs.__file__))
         + "\nfor _name in NEEDS:\n"

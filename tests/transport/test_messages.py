@@ -167,7 +167,7 @@ def test_two_new_messages_share_nothing_that_can_change(type_name: str) -> None:
 def test_a_node_imports_no_parser_of_message_definitions() -> None:
     """A package of ROS that messages import would bring it: a seventh of a node's imports."""
     program = (
-        "import sys; from neuros.transport.ros_process import _do_without_code_generator as do;"
+        "import sys; from neuros.transport.rclpy_patches import do_without_code_generator as do;"
         " do(); import rosidl_generator_py as it; from rclpy.type_support import"
         " check_for_type_support; from std_msgs.msg import String;"
         " check_for_type_support(String); print(hasattr(it, 'generate_py'), 'lark' in sys.modules)"
