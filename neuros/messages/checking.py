@@ -1,8 +1,8 @@
 """Mistakes in message packages: in their message files, and in how packages fit together.
 
 The grammar is that of rosidl (https://docs.ros.org/en/jazzy/Concepts/Basic/About-Interfaces.html),
-and its own parser judges each line. That stops at the first mistake and knows no line numbers: so
-each line is parsed by itself, and what is wrong is said in other words.
+and rosidl's parser judges each line. The parser stops at the first mistake and knows no line
+numbers: so each line is parsed by itself, and its errors are put into other words.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import keyword
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -41,7 +41,7 @@ _A_TYPE = (
 _A_PACKAGE = "a letter, then letters, digits and single '_', all lower case, as 'rover_msgs'"
 _A_FIELD = "a letter, then letters, digits and single '_', all lower case, as 'joint_positions'"
 _A_CONSTANT = "upper case letters, digits and single '_', as 'MAX_SPEED'"
-# Names of fields become names in C.
+# Names of fields become names in C, so these are reserved.
 _C = re.compile(
     "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|"
     "inline|int|long|register|restrict|return|short|signed|sizeof|static|struct|switch|typedef|"
@@ -54,7 +54,7 @@ _CPP = re.compile(
     "static_cast|template|this|thread_local|throw|true|typeid|typename|using|virtual|wchar_t|xor|"
     "xor_eq"
 )
-# Of the compiler, with GNU's extensions, and of headers that the generated code includes.
+# Macros of the compiler with GNU's extensions, and of headers that the generated code includes.
 _MACROS = re.compile("linux|unix|i386|complex|errno|st_[acm]time|s[ai]_[a-z_]+")
 
 
@@ -68,24 +68,25 @@ def check(packages: Sequence[Package], workspaces: Workspaces) -> list[Problem]:
             continue
         if text := package_name_mistake(package.name):
             problems.append(problem_at(package.folder / MANIFEST, text))
-        problems += _check_package(package, workspaces)
+        found: list[Problem] = []
+        contained: dict[str, set[str]] = {}
+        for file in (package.folder / relative for relative in package.files):
+            definition = read_definition(package.name, file)
+            found += definition.problems
+            unknown = (_unknown(package, file, use, workspaces) for use in definition.uses)
+            found += [problem for problem in unknown if problem]
+            if file.suffix == ".msg":
+                names = {use.type.partition("/") for use in definition.uses}
+                contained[file.stem] = {name for of, _, name in names if of == package.name}
+        if not found:
+            try:
+                TopologicalSorter(contained).prepare()
+            except CycleError as error:
+                circle = error.args[1]
+                text = f"found a message that contains itself: {' -> '.join(circle)}"
+                found.append(problem_at(package.folder / "msg" / f"{circle[0]}.msg", text))
+        problems += found
     return problems
-
-
-def _check_package(package: Package, workspaces: Workspaces) -> list[Problem]:
-    problems: list[Problem] = []
-    contained: dict[str, set[str]] = {}
-    for relative in package.files:
-        file = package.folder / relative
-        definition = read_definition(package.name, file)
-        problems += definition.problems
-        for use in definition.uses:
-            if problem := _unknown(package, file, use, workspaces):
-                problems.append(problem)
-        if file.suffix == ".msg":
-            names = {use.type.partition("/") for use in definition.uses}
-            contained[file.stem] = {name for of, _, name in names if of == package.name}
-    return problems or _circles(package, contained)
 
 
 def _unknown(package: Package, file: Path, use: Use, workspaces: Workspaces) -> Problem | None:
@@ -110,19 +111,9 @@ def _unknown(package: Package, file: Path, use: Use, workspaces: Workspaces) -> 
     return problem_at(file, text, use.line, use.column, hint)
 
 
-def _circles(package: Package, contained: dict[str, set[str]]) -> list[Problem]:
-    try:
-        TopologicalSorter(contained).prepare()
-    except CycleError as error:
-        circle = error.args[1]
-        text = f"found a message that contains itself: {' -> '.join(circle)}"
-        return [problem_at(package.folder / "msg" / f"{circle[0]}.msg", text)]
-    return []
-
-
 @dataclass(frozen=True)
 class Use:
-    """A message type that a field has: ``package/Name``, where it is written."""
+    """The message type of a field, ``package/Name``, and its place in the file."""
 
     type: str
     line: int
@@ -138,7 +129,7 @@ class Definition:
 
 
 def package_name_mistake(name: str) -> str:
-    """The mistake in the name of a package, empty if there is none."""
+    """What is wrong with the name of a package; empty if it is right."""
     if not is_valid_package_name(name):
         return f"found the name '{name}', expected {_A_PACKAGE}"
     if keyword.iskeyword(name):
@@ -162,16 +153,27 @@ def read_definition(package: str, file: Path) -> Definition:
         found.problems.append(problem_at(file, f"cannot be read: {error}"))
         return found
     lines = text.splitlines()
-    found.problems += _unwritable(file, lines)
-    parts = list(_parts(lines))
-    if len(parts) != _PARTS[file.suffix]:
-        found.problems.append(_wrong_parts(file, parts, lines))
-    for part in parts:
-        _read_part(package, file, part, found)
+    for number, line in enumerate(lines, 1):
+        # rosidl writes Latin-1, and reads it as UTF-8.
+        if odd := next((each for each in line if not each.isascii()), ""):
+            text = f"found '{odd}', expected ASCII, in comments, too"
+            found.problems.append(problem_at(file, text, number, line.index(odd) + 1))
+    separators = [number for number, line in enumerate(lines, 1) if line == _SEPARATOR]
+    needed = _PARTS[file.suffix] - 1
+    if len(separators) != needed:
+        almost = [n for n, line in enumerate(lines, 1) if re.fullmatch(r"\s*-{2,}\s*", line)]
+        last = separators[-1] if separators else len(lines) or 1
+        place = next((number for number in almost if number not in separators), last)
+        what = {0: "none", 1: f"one line '{_SEPARATOR}'", 2: f"two lines '{_SEPARATOR}'"}[needed]
+        text = f"found {len(separators)} lines '{_SEPARATOR}', expected {what}"
+        found.problems.append(problem_at(file, text, place))
+    for start, end in zip([0, *separators], [*separators, len(lines) + 1], strict=True):
+        _read_part(package, file, {n: lines[n - 1] for n in range(start + 1, end)}, found)
     return found
 
 
 def _read_part(package: str, file: Path, part: dict[int, str], found: Definition) -> None:
+    """Read the lines of a part, by their numbers: names must differ within it."""
     names: dict[str, int] = {}
     for number, line in part.items():
         code = line.replace("\t", " ").partition("#")[0].rstrip()
@@ -214,8 +216,14 @@ def _parsed(package: str, code: str) -> Field | Constant:
         name, _, value = (text.strip() for text in rest.partition("="))
     else:
         name, _, value = rest.partition(" ")
-    if not is_constant:
-        _check_words(name, column)
+        for language, is_reserved in (
+            ("keyword of Python", keyword.iskeyword(name)),
+            ("keyword of C", _C.fullmatch(name)),
+            ("keyword of C++", _CPP.fullmatch(name)),
+            ("macro of C", _MACROS.fullmatch(name)),
+        ):
+            if is_reserved:
+                raise _Wrong(f"the name '{name}'", f"one that is not a {language}", column)
     try:
         if is_constant:
             return Constant(type_text, name, value)
@@ -240,45 +248,3 @@ def _type(package: str, text: str) -> Type:
         raise _Wrong(
             f"the type '{text}'", _A_TYPE, 1, did_you_mean(text, set(PRIMITIVE_TYPES) - {*_ROS_1})
         ) from None
-
-
-def _check_words(name: str, column: int) -> None:
-    for language, is_taken in (
-        ("keyword of Python", keyword.iskeyword(name)),
-        ("keyword of C", _C.fullmatch(name)),
-        ("keyword of C++", _CPP.fullmatch(name)),
-        ("macro of C", _MACROS.fullmatch(name)),
-    ):
-        if is_taken:
-            raise _Wrong(f"the name '{name}'", f"one that is not a {language}", column)
-
-
-def _parts(lines: list[str]) -> Iterator[dict[int, str]]:
-    """The lines between separators, by their numbers."""
-    part: dict[int, str] = {}
-    for number, line in enumerate(lines, 1):
-        if line == _SEPARATOR:
-            yield part
-            part = {}
-        else:
-            part[number] = line
-    yield part
-
-
-def _wrong_parts(file: Path, parts: list[dict[int, str]], lines: list[str]) -> Problem:
-    needed = _PARTS[file.suffix] - 1
-    places = [number for number, line in enumerate(lines, 1) if line == _SEPARATOR]
-    almost = [n for n, line in enumerate(lines, 1) if re.fullmatch(r"\s*-{2,}\s*", line)]
-    what = {0: "none", 1: f"one line '{_SEPARATOR}'", 2: f"two lines '{_SEPARATOR}'"}[needed]
-    line = next((n for n in almost if n not in places), places[-1] if places else len(lines) or 1)
-    return problem_at(file, f"found {len(places)} lines '{_SEPARATOR}', expected {what}", line)
-
-
-def _unwritable(file: Path, lines: list[str]) -> Iterator[Problem]:
-    """Characters that rosidl stumbles over: it writes Latin-1, and reads that as UTF-8."""
-    for number, line in enumerate(lines, 1):
-        for column, character in enumerate(line, 1):
-            if not character.isascii():
-                text = f"found '{character}', expected ASCII, in comments, too"
-                yield problem_at(file, text, number, column)
-                break

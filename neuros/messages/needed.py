@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from graphlib import CycleError
@@ -20,12 +20,11 @@ from neuros.errors import EnvironmentFault, Problem
 from neuros.installation.machine import system_install
 from neuros.installation.progress import Progress
 from neuros.messages import generation
-from neuros.messages.generation import generated
-from neuros.messages.package import MANIFEST, Package, Ros
+from neuros.messages.package import MANIFEST, Package
 from neuros.messages.workspace import Built, Workspaces, cycle_problem, sweep
 from neuros.project.model import Node
 
-# What services and actions are made of, besides what their files name.
+# Packages that the generated code of services and actions needs, beside those in their files.
 _IMPLIED: Mapping[str, set[str]] = {
     ".msg": set(),
     ".srv": {"service_msgs", "builtin_interfaces"},
@@ -36,11 +35,11 @@ _IMPLIED: Mapping[str, set[str]] = {
 
 
 @dataclass(frozen=True)
-class Step:
-    """A package that is to be built.
+class PackageBuild:
+    """A package, and the folder that it is built into.
 
     Attributes:
-        needs: the packages of workspaces that it needs, directly or not, all built before it.
+        needs: builds of workspace packages that this one needs, directly or not; all come first.
     """
 
     package: Package
@@ -49,15 +48,15 @@ class Step:
 
 
 class Messages:
-    """Packages of workspaces, with all that they need, in the order of their building.
+    """Packages of workspaces with all that they need, in the order in which they are built.
 
     Args:
-        names: of packages; those that are in no workspace are left out.
+        names: packages; those of no workspace are left out.
     """
 
     def __init__(self, workspaces: Workspaces, names: Iterable[str]) -> None:
         self._workspaces = workspaces
-        self._steps: list[Step] = []
+        self._builds: list[PackageBuild] = []
         wanted = sorted(names)
         self._problems = list(workspaces.problems if wanted else workspaces.own_problems)
         if not wanted:
@@ -71,21 +70,21 @@ class Messages:
         for built in builds:
             needs = workspaces.closure(workspaces.needs(built.package))
             package = workspaces.packages[built.package]
-            self._steps.append(Step(package, built, [by_name[need.name] for need in needs]))
+            self._builds.append(PackageBuild(package, built, [by_name[n.name] for n in needs]))
 
     @classmethod
     def of_nodes(cls, nodes: Iterable[Node], workspaces: Workspaces) -> Messages:
-        """The packages that nodes need: all of the project, and the shared ones that ports name."""
+        """The packages that nodes need: all of the project, and shared ones that ports name."""
         ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
         used = {port.type.partition("/")[0] for port in ports}
-        # Shared ones are not looked for where everything comes with ROS, as it mostly does.
+        # The shared workspace is not searched if all packages come with ROS, as they mostly do.
         names = used if any(find_spec(package) is None for package in used) else ()
         return cls(workspaces, {*workspaces.own, *names})
 
     @property
     def built(self) -> list[Built]:
         """Each package, built or not."""
-        return [step.built for step in self._steps]
+        return [build.built for build in self._builds]
 
     @property
     def paths(self) -> tuple[Path, ...]:
@@ -99,7 +98,7 @@ class Messages:
 
     def problems(self) -> list[Problem]:
         """Mistakes in the files of packages; a built package had none."""
-        missing = [step.package for step in self._steps if not step.built.is_there]
+        missing = [build.package for build in self._builds if not build.built.is_there]
         if not missing:
             return self._problems
         # Imported here: most of the time everything is built.
@@ -108,7 +107,7 @@ class Messages:
         return [*self._problems, *check(missing, self._workspaces)]
 
     def note_use(self) -> None:
-        """Keep it all from being removed as unused."""
+        """Keep the builds from being removed as unused."""
         for built in self.built:
             built.note_use()
 
@@ -116,169 +115,43 @@ class Messages:
         """Build what is missing.
 
         Args:
-            environment: of the programs that this starts.
+            environment: of the generators and compilers.
 
         Raises:
-            EnvironmentFault: with a sentence for the user.
+            EnvironmentFault: if a package cannot be built.
         """
-        missing = [step for step in self._steps if not step.built.is_there]
+        missing = [build for build in self._builds if not build.built.is_there]
         if not missing:
             return
-        builder = _Builder(self._workspaces, Compilers.here(), progress, environment)
-        for step in missing:
-            builder.build(step)
+        compilers = Compilers.here()
+        for build in missing:
+            _Builder(build, self._workspaces, compilers, progress, environment).run()
         sweep(missing[0].built.folder.parent)
 
     def describe(self) -> list[str]:
         """One line per package."""
         return [
-            f"message package {step.package.name}"
-            f"{'' if step.built.is_there else ', which launching builds first'}:"
-            f" {step.built.folder}"
-            for step in self._steps
+            f"message package {build.package.name}"
+            f"{'' if build.built.is_there else ', which launching builds first'}:"
+            f" {build.built.folder}"
+            for build in self._builds
         ]
-
-
-@dataclass(frozen=True)
-class _Builder:
-    """Builds packages, with a line of progress for each."""
-
-    workspaces: Workspaces
-    compilers: Compilers
-    progress: Progress
-    environment: Mapping[str, str]
-
-    def build(self, step: Step) -> None:
-        """Build a package, or wait until another program has built it.
-
-        Raises:
-            EnvironmentFault: with a sentence for the user; then nothing of the package is left but
-                a log.
-        """
-        name, built = step.package.name, step.built
-        try:
-            with built.locked(wait=False) as is_mine:
-                if is_mine:
-                    self._build(step)
-                    return
-            self.progress.step(f"waiting for another program that builds {name}")
-            with built.locked():
-                self._build(step)
-        except OSError as error:
-            raise EnvironmentFault(
-                f"message package '{name}' cannot be built in {built.folder.parent}"
-                f" ({error.strerror or error}): make room (df -h), or set XDG_CACHE_HOME"
-            ) from error
-
-    def _build(self, step: Step) -> None:
-        """Build one package; its lock is held."""
-        package, built = step.package, step.built
-        if built.is_there:  # by another program, meanwhile
-            return
-        self.progress.step(f"building {package.name}: {package.summary} ({package.folder})")
-        draft, source = built.draft, built.draft / "source"
-        shutil.rmtree(draft, ignore_errors=True)
-        try:
-            source.mkdir(parents=True)
-            self._generate(step, source)
-            others = _others(package, source)
-            needs = {need.package: need.folder for need in step.needs}
-            tools = (self.workspaces.ros, self.compilers, self.environment)
-            compile_package(Job(package.name, source, draft, others, needs, *tools))
-            _install(package, source, draft)
-            shutil.rmtree(source)
-            if built not in self.workspaces.builds([package.name]):
-                raise EnvironmentFault(
-                    f"message package '{package.name}' was changed while it was built: start again"
-                )
-            draft.rename(built.folder)
-            built.log.unlink(missing_ok=True)
-        except CompilationError as error:
-            built.log.write_text(str(error), "utf-8")
-            raise EnvironmentFault(
-                f"message package '{package.name}' cannot be built: {_cause(str(error))} (log:"
-                f" {built.log})"
-            ) from error
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
-
-    def _generate(self, step: Step, source: Path) -> None:
-        package, ros = step.package, self.workspaces.ros
-        shares = {name: str(ros.share(name)) for name in ros.message_packages()}
-        shares |= {need.package: str(need.share) for need in step.needs}
-        order = generation.Order(
-            package.name,
-            str(package.folder),
-            [file.as_posix() for file in package.files],
-            str(source),
-            str(ros.prefix),
-            shares,
-        )
-        # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.
-        command = [sys.executable, "-I", generation.__file__]
-        _run_program(command, self.environment, order.text())
-
-
-def _others(package: Package, source: Path) -> set[str]:
-    """The packages that its messages refer to, with what these refer to."""
-    others = {name for file in package.files for name in _IMPLIED[file.suffix]}
-    descriptions = generation.generated(source, generation.DESCRIPTIONS, package.name)
-    for file in descriptions.rglob("*.json"):
-        hashes = json.loads(file.read_text("utf-8"))["type_hashes"]
-        others |= {each["type_name"].partition("/")[0] for each in hashes}
-    return others - {package.name}
-
-
-def _install(package: Package, source: Path, prefix: Path) -> None:
-    """Put what was generated where it is looked for, as in a ROS distribution."""
-    share, python = prefix / "share" / package.name, prefix / "python" / package.name
-    for generator in (generation.INTERFACES, generation.DESCRIPTIONS):
-        _copy(generation.generated(source, generator, package.name), share, {".idl", ".json"})
-    for file in (Path(MANIFEST), *package.files):
-        shutil.copyfile(package.folder / file, share / file)
-    for generator in HEADERS:
-        folder = generation.generated(source, generator, package.name)
-        _copy(folder, prefix / "include" / package.name / package.name, {".h"})
-    _copy(generation.generated(source, "rosidl_generator_py", package.name), python, {".py"})
-    (python / "__init__.py").touch()
-    index = prefix / "share" / "ament_index" / "resource_index" / "packages"
-    index.mkdir(parents=True)
-    (index / package.name).touch()
-
-
-def _copy(source: Path, target: Path, suffixes: set[str]) -> None:
-    for file in source.rglob("*"):
-        if file.suffix in suffixes:
-            out = target / file.relative_to(source)
-            out.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, out)
-
-
-def _cause(output: str) -> str:
-    """The line that says most: the first error of the compiler, or the last one of a generator."""
-    rows = [row.strip() for row in output.splitlines() if row.strip()]
-    errors = [row for row in rows if re.search(r"\berror: ", row)]
-    return (errors[:1] or rows[-1:] or ["for no known reason"])[0][:300]
-
-
-# ---------------------------------------------------------------------- compilation
-#
-# Compiles generated C to libraries with gcc, called as CMake calls it for a release.
 
 
 _ABI = Path(__file__).with_name("stable_abi.h")
 _C = ("-std=gnu11", "-O2", "-fPIC", "-DNDEBUG", "-w")
 _CPP = ("-std=c++17", "-O2", "-fPIC", "-DNDEBUG", "-w")
 _LINK = ("-shared", "-Wl,--strip-all", "-Wl,--as-needed", "-Wl,--no-undefined")
-HEADERS = (
+# Python brings its symbols itself, and its libraries differ from one version to the next.
+_UNRESOLVED = "-Wl,--unresolved-symbols=ignore-all"
+_TO_C, _TO_PYTHON = "rosidl_generator_c", "rosidl_generator_py"
+# Generators that write headers.
+_HEADERS = (
     "rosidl_generator_c",
     "rosidl_typesupport_introspection_c",
     "rosidl_typesupport_fastrtps_c",
 )
-"""The generators that write headers."""
-
-_TO_C, _TO_PYTHON = "rosidl_generator_c", "rosidl_generator_py"
-# Each library with what it needs of ROS; generators of its name make its code.
+# Each library with the libraries of ROS that it needs; the generator of its name makes its code.
 _LIBRARIES: Mapping[str, Sequence[str]] = {
     "rosidl_generator_c": ("rosidl_runtime_c", "rosidl_typesupport_c", "rcutils"),
     "rosidl_typesupport_introspection_c": (
@@ -295,12 +168,12 @@ _LIBRARIES: Mapping[str, Sequence[str]] = {
 
 
 class CompilationError(Exception):
-    """An error of the compiler, with its output."""
+    """A generator or the compiler has failed; the text is its command and output."""
 
 
 @dataclass(frozen=True)
 class Compilers:
-    """The programs, and the headers of Python and NumPy."""
+    """The programs, and the folders of the headers of Python and NumPy."""
 
     c: str
     cpp: str
@@ -308,7 +181,7 @@ class Compilers:
 
     @classmethod
     def here(cls) -> Compilers:
-        """Those of this machine.
+        """The compilers of this machine.
 
         Raises:
             EnvironmentFault: with the command that installs what is missing.
@@ -332,143 +205,219 @@ class Compilers:
 
 
 @dataclass(frozen=True)
-class Job:
-    """A package to compile.
+class _Builder:
+    """Builds one package with rosidl's generators and gcc, as CMake does for a release.
 
-    Attributes:
-        source: the output of the generators.
-        prefix: gets ``lib``, ``include`` and ``python``.
-        others: the packages whose messages this one contains, or refers to.
-        built: the packages of workspaces that it needs, by name: the folders of their builds.
+    The package is built in a draft, which gets its name when it is whole.
     """
 
-    package: str
-    source: Path
-    prefix: Path
-    others: Collection[str]
-    built: Mapping[str, Path]
-    ros: Ros
+    build: PackageBuild
+    workspaces: Workspaces
     compilers: Compilers
+    progress: Progress
     environment: Mapping[str, str]
 
-    def library(self, kind: str) -> Path:
-        return self.prefix / "lib" / f"lib{self.package}__{kind}.so"
+    @property
+    def _name(self) -> str:
+        return self.build.package.name
 
+    @property
+    def _prefix(self) -> Path:
+        """The draft, which gets ``lib``, ``include``, ``python`` and ``share``."""
+        return self.build.built.draft
 
-def compile_package(job: Job) -> None:
-    """Make the libraries of a package and its module for Python.
+    @property
+    def _source(self) -> Path:
+        return self._prefix / "source"
 
-    Raises:
-        CompilationError: if the compiler fails.
-    """
-    sources = [
-        file
-        for kind in _LIBRARIES
-        for file in sorted(generated(job.source, kind, job.package).rglob("*.c*"))
-    ]
-    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
-        objects = dict(
-            zip(sources, pool.map(lambda file: _compile(job, file), sources), strict=True)
+    def _generated(self, generator: str) -> Path:
+        return generation.generated(self._source, generator, self._name)
+
+    def _library(self, kind: str) -> Path:
+        return self._prefix / "lib" / f"lib{self._name}__{kind}.so"
+
+    def run(self) -> None:
+        """Build the package, or wait until another program has built it.
+
+        Raises:
+            EnvironmentFault: if it cannot be built; only a log is left of it then.
+        """
+        built = self.build.built
+        try:
+            with built.locked(wait=False) as is_mine:
+                if is_mine:
+                    self._make()
+                    return
+            self.progress.step(f"waiting for another program that builds {self._name}")
+            with built.locked():
+                self._make()
+        except OSError as error:
+            raise EnvironmentFault(
+                f"message package '{self._name}' cannot be built in {built.folder.parent}"
+                f" ({error.strerror or error}): make room (df -h), or set XDG_CACHE_HOME"
+            ) from error
+
+    def _make(self) -> None:
+        package, built = self.build.package, self.build.built
+        if built.is_there:  # another program has built it meanwhile
+            return
+        self.progress.step(f"building {package.name}: {package.summary} ({package.folder})")
+        shutil.rmtree(self._prefix, ignore_errors=True)
+        try:
+            self._source.mkdir(parents=True)
+            self._generate()
+            self._compile()
+            self._install()
+            shutil.rmtree(self._source)
+            if built not in self.workspaces.builds([package.name]):
+                raise EnvironmentFault(
+                    f"message package '{package.name}' was changed while it was built: start again"
+                )
+            self._prefix.rename(built.folder)
+            built.log.unlink(missing_ok=True)
+        except CompilationError as error:
+            built.log.write_text(str(error), "utf-8")
+            rows = [row.strip() for row in str(error).splitlines() if row.strip()]
+            errors = [row for row in rows if re.search(r"\berror: ", row)]
+            cause = (errors or rows[-1:])[0][:300]  # of a generator, the last line tells most
+            raise EnvironmentFault(
+                f"message package '{package.name}' cannot be built: {cause} (log: {built.log})"
+            ) from error
+        finally:
+            shutil.rmtree(self._prefix, ignore_errors=True)
+
+    def _generate(self) -> None:
+        package, ros = self.build.package, self.workspaces.ros
+        shares = {name: str(ros.share(name)) for name in ros.message_packages()}
+        shares |= {need.package: str(need.share) for need in self.build.needs}
+        order = generation.Order(
+            package.name,
+            str(package.folder),
+            [file.as_posix() for file in package.files],
+            str(self._source),
+            str(ros.prefix),
+            shares,
         )
-    (job.prefix / "lib").mkdir(parents=True)
-    entry = f"_{job.package}_s.ep."
-    for kind, needs in _LIBRARIES.items():
-        folder = generated(job.source, kind, job.package)
-        own = [o for s, o in objects.items() if folder in s.parents and entry not in s.name]
-        _link_library(job, kind, own, needs)
-    _link_module(job, [o for s, o in objects.items() if s.name.startswith(entry)])
+        # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.
+        self._run([sys.executable, "-I", generation.__file__], order.text())
+
+    def _compile(self) -> None:
+        """Make the libraries of the package, and its module for Python."""
+        sources = [f for kind in _LIBRARIES for f in sorted(self._generated(kind).rglob("*.c*"))]
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:
+            objects = dict(zip(sources, pool.map(self._object, sources), strict=True))
+        others = self._others()
+        (self._prefix / "lib").mkdir(parents=True)
+        entry = f"_{self._name}_s.ep."
+        built = {need.package: need.folder for need in self.build.needs}
+        ros = self.workspaces.ros.lib
+        for kind, needs in _LIBRARIES.items():
+            folder = self._generated(kind)
+            own = [o for s, o in objects.items() if folder in s.parents and entry not in s.name]
+            libraries = [self._library(_TO_C)] if kind != _TO_C else []
+            libraries += [
+                (built[other] / "lib" if other in built else ros) / f"lib{other}__{which}.so"
+                for other in sorted(others)
+                for which in dict.fromkeys([kind, _TO_C])
+            ]
+            libraries += [ros / f"lib{name}.so" for name in needs]
+            out = self._library(kind)
+            options = [_UNRESOLVED] if kind == _TO_PYTHON else []
+            inputs = [*own, *(library for library in libraries if library.exists())]
+            self._link(
+                self.compilers.cpp, out, inputs, [*options, f"-Wl,-soname,{out.name}"], "$ORIGIN"
+            )
+        # The module brings all libraries along: ROS opens some of them by their names, and finds
+        # those that are open already.
+        out = self._prefix / "python" / self._name / f"{self._name}_s__rosidl_typesupport_c.abi3.so"
+        out.parent.mkdir(parents=True)
+        inputs = [o for s, o in objects.items() if s.name.startswith(entry)]
+        inputs += map(self._library, _LIBRARIES)
+        options = ["-Wl,--no-as-needed", _UNRESOLVED]
+        self._link(self.compilers.c, out, inputs, options, "$ORIGIN/../../lib")
+
+    def _object(self, source: Path) -> Path:
+        """Compile a file."""
+        out = source.with_suffix(f"{source.suffix}.o")
+        include = self.workspaces.ros.include
+        own = [self._generated(kind).parent for kind in _HEADERS]
+        others = [need.folder / "include" / need.package for need in self.build.needs]
+        # In ROS the headers of a package are in a folder of its name twice; fastcdr has one.
+        ros = [include, *sorted(p for p in include.iterdir() if p.is_dir())]
+        python: list[str] = []
+        if self._generated(_TO_PYTHON) in source.parents:
+            python = ["-include", str(_ABI)]
+            ros = [*self.compilers.python_headers, *ros]
+        is_c = source.suffix == ".c"
+        command = [self.compilers.c, *_C] if is_c else [self.compilers.cpp, *_CPP]
+        includes = [*(f"-I{folder}" for folder in own), *(f"-isystem{p}" for p in (*others, *ros))]
+        self._run([*command, *includes, *python, "-c", str(source), "-o", str(out)])
+        return out
+
+    def _link(
+        self, compiler: str, out: Path, inputs: Iterable[Path], options: Iterable[str], lib: str
+    ) -> None:
+        """Link a library.
+
+        Args:
+            lib: the folder ``lib`` of this package, seen from the library: there it finds others,
+                and by the path from there those of other packages of workspaces.
+        """
+        folders = [need.folder for need in self.build.needs]
+        search = [lib, *(f"{lib}/../../{folder.name}/lib" for folder in folders)]
+        linked = [self._prefix / "lib", self.workspaces.ros.lib, *(f / "lib" for f in folders)]
+        command = [compiler, *_LINK, *options, "-o", str(out), *map(str, inputs)]
+        command += [f"-Wl,-rpath,{':'.join(search)}"]
+        self._run([*command, *(f"-Wl,-rpath-link,{folder}" for folder in linked)])
+
+    def _others(self) -> set[str]:
+        """The packages that the messages refer to, with what these refer to."""
+        others = {name for file in self.build.package.files for name in _IMPLIED[file.suffix]}
+        for file in self._generated(generation.DESCRIPTIONS).rglob("*.json"):
+            hashes = json.loads(file.read_text("utf-8"))["type_hashes"]
+            others |= {each["type_name"].partition("/")[0] for each in hashes}
+        return others - {self._name}
+
+    def _install(self) -> None:
+        """Copy what was generated to the folders of a ROS distribution."""
+        package, prefix = self.build.package, self._prefix
+        share, python = prefix / "share" / package.name, prefix / "python" / package.name
+        for generator in (generation.INTERFACES, generation.DESCRIPTIONS):
+            _copy(self._generated(generator), share, {".idl", ".json"})
+        for file in (Path(MANIFEST), *package.files):
+            shutil.copyfile(package.folder / file, share / file)
+        for generator in _HEADERS:
+            include = prefix / "include" / package.name / package.name
+            _copy(self._generated(generator), include, {".h"})
+        _copy(self._generated(_TO_PYTHON), python, {".py"})
+        (python / "__init__.py").touch()
+        index = prefix / "share" / "ament_index" / "resource_index" / "packages"
+        index.mkdir(parents=True)
+        (index / package.name).touch()
+
+    def _run(self, command: Sequence[str], given: str = "") -> None:
+        """Run a generator or compiler; ``given`` is its standard input.
+
+        Raises:
+            CompilationError: if it fails.
+        """
+        done = subprocess.run(
+            command,
+            cwd=self._source,
+            env=self.environment,
+            input=given,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+        )
+        if done.returncode:
+            raise CompilationError(f"{' '.join(command)}\n{done.stdout}{done.stderr}")
 
 
-def _compile(job: Job, source: Path) -> Path:
-    out = source.with_suffix(f"{source.suffix}.o")
-    own = [generated(job.source, kind, job.package).parent for kind in HEADERS]
-    others = [folder / "include" / name for name, folder in job.built.items()]
-    # In ROS the headers of a package are in a folder of its name twice; fastcdr has one.
-    ros = [job.ros.include, *sorted(p for p in job.ros.include.iterdir() if p.is_dir())]
-    python: list[str] = []
-    if generated(job.source, _TO_PYTHON, job.package) in source.parents:
-        python = ["-include", str(_ABI)]
-        ros = [*job.compilers.python_headers, *ros]
-    is_c = source.suffix == ".c"
-    command = [job.compilers.c, *_C] if is_c else [job.compilers.cpp, *_CPP]
-    includes = [*(f"-I{folder}" for folder in own), *(f"-isystem{p}" for p in (*others, *ros))]
-    _run(job, [*command, *includes, *python, "-c", str(source), "-o", str(out)])
-    return out
-
-
-def _link_library(job: Job, kind: str, objects: Sequence[Path], needs: Iterable[str]) -> None:
-    out = job.library(kind)
-    kinds = dict.fromkeys([kind, _TO_C])
-    own = [job.library(_TO_C)] if kind != _TO_C else []
-    others = [_library_of(job, other, which) for other in sorted(job.others) for which in kinds]
-    libraries = [*own, *others, *(job.ros.lib / f"lib{name}.so" for name in needs)]
-    # Python brings its symbols itself, and its libraries differ from one version to the next.
-    undefined = ["-Wl,--unresolved-symbols=ignore-all"] if kind == _TO_PYTHON else []
-    command = [
-        *(job.compilers.cpp, *_LINK, *undefined, "-o", str(out), f"-Wl,-soname,{out.name}"),
-        *map(str, objects),
-        *(str(library) for library in libraries if library.exists()),
-        *_search(job, "$ORIGIN"),
-    ]
-    _run(job, command)
-
-
-def _link_module(job: Job, objects: Sequence[Path]) -> None:
-    """Link the module that Python imports; it brings all libraries along.
-
-    ROS opens some of them by their names, and finds those that are open already.
-    """
-    out = job.prefix / "python" / job.package / f"{job.package}_s__rosidl_typesupport_c.abi3.so"
-    out.parent.mkdir(parents=True)
-    command = [
-        *(job.compilers.c, *_LINK, "-Wl,--no-as-needed", "-Wl,--unresolved-symbols=ignore-all"),
-        *("-o", str(out)),
-        *map(str, objects),
-        *(str(job.library(kind)) for kind in _LIBRARIES),
-        *_search(job, "$ORIGIN/../../lib"),
-    ]
-    _run(job, command)
-
-
-def _library_of(job: Job, other: str, kind: str) -> Path:
-    """A library of another package, which need not be there."""
-    name = f"lib{other}__{kind}.so"
-    return (job.built[other] / "lib" if other in job.built else job.ros.lib) / name
-
-
-def _search(job: Job, lib: str) -> list[str]:
-    """Where libraries look for others: beside them, and in the packages of the workspaces."""
-    up = f"{lib}/../.."
-    folders = [lib, *(f"{up}/{folder.name}/lib" for folder in job.built.values())]
-    linked = [f"-Wl,-rpath-link,{folder}" for folder in (job.prefix / "lib", job.ros.lib)]
-    linked += [f"-Wl,-rpath-link,{folder / 'lib'}" for folder in job.built.values()]
-    return [f"-Wl,-rpath,{':'.join(folders)}", *linked]
-
-
-def _run(job: Job, command: Sequence[str]) -> None:
-    _run_program(command, job.environment, folder=job.source)
-
-
-def _run_program(
-    command: Sequence[str],
-    environment: Mapping[str, str],
-    given: str = "",
-    folder: Path | None = None,
-) -> None:
-    """Run a program of the build; raises ``CompilationError`` if it fails.
-
-    Args:
-        given: for its standard input.
-    """
-    done = subprocess.run(
-        command,
-        cwd=folder,
-        env=environment,
-        input=given,
-        capture_output=True,
-        text=True,
-        errors="replace",
-        check=False,
-    )
-    if done.returncode:
-        raise CompilationError(f"{' '.join(command)}\n{done.stdout}{done.stderr}")
+def _copy(source: Path, target: Path, suffixes: set[str]) -> None:
+    for file in source.rglob("*"):
+        if file.suffix in suffixes:
+            out = target / file.relative_to(source)
+            out.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, out)

@@ -284,8 +284,8 @@ class TestBuilding:
         compilers = Compilers("gcc", "g++", ())
         monkeypatch.setattr(Compilers, "here", lambda: compilers)
         monkeypatch.setattr(needed._Builder, "_generate", lambda *_: file.write_text("float32 x\n"))
-        for part in ("_others", "compile_package", "_install"):
-            monkeypatch.setattr(needed, part, lambda *_: None)
+        for part in ("_compile", "_install"):
+            monkeypatch.setattr(needed._Builder, part, lambda *_: None)
 
         with pytest.raises(EnvironmentFault, match="'a_msgs' was changed while it was built"):
             messages.make(Progress(io.StringIO()), {})
