@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.api.run_record import open_run, run_table
+from neuros.api.run_record import PastRun, open_run, run_table
 from neuros.errors import RunError
 from neuros.project.scanner import read_bytes
 from neuros.registry import BAG_FORMATS
@@ -22,7 +22,7 @@ _LATENCIES = ("p50", "p90", "p99", "max")
 _SUMMED = ("executing", "waiting", "blocked")
 
 
-class Run:
+class Run(PastRun):
     """What a run has left behind: how it ended, its figures, its packets, its logs.
 
     Attributes:
@@ -37,8 +37,8 @@ class Run:
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = Path(folder).absolute()
-        self.record: Mapping[str, Any] = open_run(self.folder).record
+        path = Path(folder).absolute()
+        super().__init__(path, open_run(path).record)
 
     @property
     def project(self) -> str:
@@ -81,17 +81,6 @@ class Run:
     def real_time_factor(self) -> float | None:
         """Simulated time by wall time, without initialisation and ending."""
         return _number(self.record["real_time_factor"])
-
-    @cached_property
-    def connections(self) -> dict[str, Mapping[str, Any]]:
-        """The figures of each connection, by ``a.out -> b.in``: ``sent``, ``consumed``, ..."""
-        return {each["connection"]: each for each in self.record["connections"]}
-
-    @property
-    def nodes(self) -> Mapping[str, Mapping[str, Any]]:
-        """The figures of each node, by name: ``accounting``, ``hooks``, ..."""
-        found: Mapping[str, Mapping[str, Any]] = self.record["nodes"]
-        return found
 
     @property
     def node_results(self) -> dict[str, Mapping[str, Any]]:

@@ -1,8 +1,4 @@
-"""Record of a run (``run.json``): made from the last reports of its nodes, read again, and checked.
-
-:func:`open_run` refuses what it cannot rely on. :func:`losses` and :func:`broken_budgets` check the
-record.
-"""
+"""Record of a run (``run.json``): made from the last reports of its nodes, checked, shown, read."""
 
 from __future__ import annotations
 
@@ -32,7 +28,7 @@ def run_record(
     wall_s: float,
     run_folder: Path,
 ) -> dict[str, Any]:
-    """Everything that is known about a run, ready for JSON. Times are in seconds."""
+    """The content of ``run.json`` that comes from the nodes; times in seconds."""
     sim_times = [r.sim_time for r in ended.reports.values() if r.sim_time is not None]
     sim_s, running_s = max(sim_times, default=None), ended.running_s
     all_metrics = {**ended.elsewhere, **{n: r.metrics or {} for n, r in ended.reports.items()}}
@@ -67,23 +63,32 @@ def run_record(
 
 
 def run_table(record: Mapping[str, Any]) -> str:
-    """The record as text: connections, nodes, and times."""
+    """The record as text: connections, nodes, system load, and times."""
     from tabulate import tabulate
 
-    counts: tuple[str, ...] = _COUNTS
+    counts = [*_COUNTS]
     if any(c.get("in_flight") for c in record["connections"]):
-        counts = (*counts, "in_flight")
+        counts.append("in_flight")
     connections = [[c["connection"], *(c[key] for key in counts)] for c in record["connections"]]
-    header = ("connection", *(count.replace("_", " ") for count in counts))
-    nodes = [[name, *_shares(node, record["running_s"])] for name, node in record["nodes"].items()]
-    parts = [
-        tabulate(rows, header, missingval="?", disable_numparse=True, colalign=("left", *right))
-        for header, rows, right in (
-            (header, connections, ["right"] * len(counts)),
-            (("node", *_STATES, "remark"), nodes, ["right"] * len(_STATES)),
-        )
-        if rows
-    ]
+    nodes = []
+    for name, node in record["nodes"].items():
+        spent = time_budget_of(node, record["running_s"])
+        if spent is None:
+            nodes.append([name, *("?" for _ in _STATES), "never reported"])
+            continue
+        shares = spent.shares.values() if spent.total_s else ()
+        cells = [f"{share:.0%}" for share in shares] or ["-" for _ in _STATES]
+        nodes.append([name, *cells, "" if node["report"] == "final" else node["report"]])
+    parts = []
+    for rows, header, numbers in (
+        (connections, ["connection", *(count.replace("_", " ") for count in counts)], counts),
+        (nodes, ["node", *_STATES, "remark"], _STATES),
+    ):
+        if rows:
+            align = ["left", *("right" for _ in numbers)]
+            parts.append(
+                tabulate(rows, header, missingval="?", disable_numparse=True, colalign=align)
+            )
     if "system_load" in record:
         from neuros.recording.system_load import load_table  # images of nodes have no psutil
 
@@ -94,7 +99,16 @@ def run_table(record: Mapping[str, Any]) -> str:
         for c in record["connections"]
         if "bytes" in c
     ]
-    return "\n\n".join([*parts, _times(record)])
+    times = f"wall time {record['wall_s']:.2f} s"
+    if record.get("paused_s"):  # missing in records of earlier versions
+        times += f" ({record['paused_s']:.2f} s of it paused)"
+    if record["sim_s"] is not None:
+        times = (
+            f"simulated time {record['sim_s']:.2f} s, {times}, real-time factor"
+            f" {record['real_time_factor'] or 0:.2f} ({record['running_s'] or 0:.2f} s without"
+            " initialisation and ending)"
+        )
+    return "\n\n".join([*parts, times])
 
 
 def consumed_percent(connection: Mapping[str, Any]) -> float | None:
@@ -104,7 +118,10 @@ def consumed_percent(connection: Mapping[str, Any]) -> float | None:
 
 
 def _timeline(points: Sequence[Sequence[float]], ended: Outcome) -> list[list[float]]:
-    """Points of simulated and wall time, from the first hook on; a reset takes the first back."""
+    """Simulated and wall time in seconds from the first hook on, a point per simulated second.
+
+    Simulated time goes back at a reset.
+    """
     start_s = ended.started_s or 0.0
     found: list[list[float]] = []
     for sim_s, wall_s in points:
@@ -126,7 +143,7 @@ def _connection(
     incoming = all_metrics.get(connection.destination_node, {}).get("incoming", {}).get(key, {})
     fields = ("received", "consumed", "discarded", "unread", "longest_discard")
     sent, received = outgoing.get("sent"), incoming.get("received")
-    # Counts that a node has last reported before it was killed are older than those of the other.
+    # The last counts of a killed node are older than those of the node at the other end.
     in_flight, lost, running_s, reports = None, None, ended.running_s, ended.reports
     nodes = {connection.source_node, connection.destination_node} & {*reports}
     is_known = all(reports[node].is_final for node in nodes)
@@ -168,37 +185,13 @@ def _node(name: str, ended: Outcome) -> dict[str, Any]:
 
 
 def _results(node_folder: Path) -> dict[str, Any]:
-    """The results that the node's plugin has saved."""
     try:
         return read_object(node_folder / "results.json")
     except (FileNotFoundError, EnvironmentFault):
         return {}
 
 
-def _shares(node: Mapping[str, Any], running_s: float | None) -> list[str]:
-    spent = time_budget_of(node, running_s)
-    if spent is None:
-        return [*("?" for _ in _STATES), "never reported"]
-    remark = "" if node["report"] == "final" else node["report"]
-    if not spent.total_s:
-        return [*("-" for _ in _STATES), remark]
-    return [*(f"{share:.0%}" for share in spent.shares.values()), remark]
-
-
-def _times(record: Mapping[str, Any]) -> str:
-    wall = f"wall time {record['wall_s']:.2f} s"
-    if record.get("paused_s"):  # records of earlier versions do not say
-        wall += f" ({record['paused_s']:.2f} s of it paused)"
-    if record["sim_s"] is None:
-        return wall
-    return (
-        f"simulated time {record['sim_s']:.2f} s, {wall}, real-time factor"
-        f" {record['real_time_factor'] or 0:.2f} ({record['running_s'] or 0:.2f} s without"
-        " initialisation and ending)"
-    )
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PastRun:
     """The folder of a run and its ``run.json``.
 
@@ -211,12 +204,12 @@ class PastRun:
 
     @cached_property
     def nodes(self) -> dict[str, Mapping[str, Any]]:
-        """The figures of each node; without ``accounting`` where it never reported."""
+        """The figures of each node by name: ``hooks``, and ``accounting`` if it has reported."""
         return {name: dict(node) for name, node in self.record.get("nodes", {}).items()}
 
     @cached_property
     def connections(self) -> dict[str, Mapping[str, Any]]:
-        """The figures of each connection, by ``a.out -> b.in``, in their order."""
+        """The figures of each connection, by ``a.out -> b.in``: ``sent``, ``consumed``, ..."""
         return {each["connection"]: each for each in self.record.get("connections", ())}
 
     @cached_property
@@ -226,7 +219,7 @@ class PastRun:
 
 
 def connection_of(figures: Mapping[str, Any]) -> Connection:
-    """A connection as the project has it, from what ``run.json`` has of it."""
+    """A connection of the project, from its figures in ``run.json``."""
     ends = figures["connection"].split(" -> ")
     (source, output), (destination, input_) = (end.split(".") for end in ends)
     limit, queue_size = figures.get("discard_limit"), figures.get("queue_size", 1)
@@ -237,8 +230,8 @@ def open_run(folder: Path) -> PastRun:
     """Read a run folder.
 
     Raises:
-        UsageError: if it is none, the run has not ended, or another version of NeuROS wrote it.
-        EnvironmentFault: if it is damaged.
+        UsageError: if there is no run, it has not ended, or another version of NeuROS wrote it.
+        EnvironmentFault: if ``run.json`` is damaged.
     """
     run = PastRun(folder, read_run_file(folder))
     if "connections" not in run.record:
@@ -247,9 +240,10 @@ def open_run(folder: Path) -> PastRun:
 
 
 def open_whole(folder: Path) -> PastRun:
-    """Read a run folder, or one that holds those of all parts of a run: of it as a whole.
+    """Read a run folder, or a folder that holds those of all parts of one run.
 
-    Raises as :func:`open_run`.
+    Raises:
+        UsageError, EnvironmentFault: as :func:`open_run`.
     """
     files = sorted(folder.glob(f"*/{RUN_FILE}"))
     if (folder / RUN_FILE).exists() or not files:
@@ -265,7 +259,7 @@ def open_whole(folder: Path) -> PastRun:
 
 
 def losses(record: Mapping[str, Any]) -> list[str]:
-    """A sentence for each lossless connection that lost packets, or may have, from ``run.json``."""
+    """A sentence for each lossless connection that lost packets, or may have lost some."""
     found = []
     for connection in record["connections"]:
         lost, sent, received = (connection[key] for key in ("lost", "sent", "received"))
@@ -275,18 +269,18 @@ def losses(record: Mapping[str, Any]) -> list[str]:
         if lost is not None:
             packets = "packet" if lost == 1 else "packets"
             found.append(f"{name} lost {lost} {packets}, though it is lossless (discard_limit 0)")
+            continue
+        if sent is None:
+            why = "the number of packets that were sent is not known"
+        elif received is None:
+            why = f"it is not known how many of {sent} packets arrived"
         else:
-            found.append(f"{name} is lossless (discard_limit 0), but {_unknown(sent, received)}")
+            why = (
+                "the number of packets that it lost is not known: the last report of a node is"
+                " missing"
+            )
+        found.append(f"{name} is lossless (discard_limit 0), but {why}")
     return found
-
-
-def _unknown(sent: int | None, received: int | None) -> str:
-    """Say which count is missing for that of lost packets."""
-    if sent is None:
-        return "the number of packets that were sent is not known"
-    if received is None:
-        return f"it is not known how many of {sent} packets arrived"
-    return "the number of packets that it lost is not known: the last report of a node is missing"
 
 
 def broken_budgets(
@@ -294,22 +288,21 @@ def broken_budgets(
 ) -> list[str]:
     """A sentence for each budget that a run has broken, from its ``run.json``.
 
-    A figure that is not known breaks its budget, except where another part of the project has it
-    (``is_partial``).
+    An unknown figure breaks its budget, unless ``is_partial``: another part of the run may know it.
     """
     return [
-        *_losses(record, budgets.lost_packets),
+        *_excess_losses(record, budgets.lost_packets),
         *_slowness(record, budgets.real_time_factor, is_partial),
-        *_irregularity(record, budgets.tick_error_ms),
+        *_irregular_ticks(record, budgets.tick_error_ms),
     ]
 
 
-def _losses(record: Mapping[str, Any], limits: Mapping[str, int]) -> Iterator[str]:
+def _excess_losses(record: Mapping[str, Any], limits: Mapping[str, int]) -> Iterator[str]:
     for connection in record["connections"]:
-        limit = limits.get(connection["connection"])
+        name, lost, discarded = (connection[key] for key in ("connection", "lost", "discarded"))
+        limit = limits.get(name)
         if limit is None or not _has_begun(connection, record):
             continue
-        name, lost, discarded = (connection[key] for key in ("connection", "lost", "discarded"))
         if lost is None or discarded is None:
             yield f"it is not known how many packets {name} lost; the limit is {limit}"
         elif lost + discarded > limit:
@@ -323,8 +316,8 @@ def _slowness(record: Mapping[str, Any], least: float | None, is_partial: bool) 
     factor = record["real_time_factor"]
     if least is None:
         return
-    owners = [n for n, node in record["nodes"].items() if node.get("sim_time") is not None]
-    if not all(_is_known(record["nodes"][name]) for name in owners):
+    owners = {n: node for n, node in record["nodes"].items() if node.get("sim_time") is not None}
+    if any(node.get("report") != "final" for node in owners.values()):
         yield (
             f"the real-time factor must be at least {least:g}, but is not known: the last report"
             f" of {' and '.join(owners)} is missing"
@@ -338,12 +331,12 @@ def _slowness(record: Mapping[str, Any], least: float | None, is_partial: bool) 
         )
 
 
-def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator[str]:
+def _irregular_ticks(record: Mapping[str, Any], limit_ms: float | None) -> Iterator[str]:
     if limit_ms is None:
         return
     for node, metrics in record["nodes"].items():
         ticks_of = {hook: each.get("ticks") for hook, each in (metrics.get("hooks") or {}).items()}
-        if any(ticks_of.values()) and not _is_known(metrics):
+        if any(ticks_of.values()) and metrics.get("report") != "final":
             yield (
                 f"it is not known how far ticks of {node} were off their period; the limit is"
                 f" {limit_ms:g} ms"
@@ -358,14 +351,9 @@ def _irregularity(record: Mapping[str, Any], limit_ms: float | None) -> Iterator
 
 
 def _has_begun(connection: Mapping[str, Any], record: Mapping[str, Any]) -> bool:
-    """Whether a packet may have been sent: not before the nodes at both ends had begun."""
+    """Whether a packet may have been sent: the nodes at both ends have begun."""
     ends = (end.partition(".")[0] for end in connection["connection"].split(" -> "))
     here = [record["nodes"][node] for node in ends if node in record["nodes"]]
     if len(here) < 2 and not (connection["sent"] or connection["received"]):
         return False  # the node elsewhere never came, as far as is known here
     return all(node["report"] is not None for node in here)
-
-
-def _is_known(node: Mapping[str, Any]) -> bool:
-    """Whether the figures of a node are those of its end."""
-    return bool(node.get("report") == "final")
