@@ -1,8 +1,8 @@
-"""Generates C and Python from definitions with rosidl's generators, called as CMake calls them.
+"""Program that generates C and Python from message definitions, with rosidl's generators.
 
-They print to standard output, replace it, and keep state in modules: they run in a process of
-their own, an isolated Python, which reads what to do from standard input.
-Each has a folder of its own, since their files collide.
+The generators print to standard output, replace it, and keep state in modules. So they run in an
+isolated Python process, which reads an :class:`Order` from standard input. Each generator has its
+own folder, since their files collide.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 INTERFACES = "rosidl_adapter"
 DESCRIPTIONS = "rosidl_generator_type_description"
 TYPE_SUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c")
-"""What the middleware needs; the second one, too: it makes its type object of it."""
+"""Type supports that the middleware needs; it makes its type object from the second one."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class Order:
 
     Attributes:
         package: the name.
-        folder: the package's.
-        files: its interface files, relative to it.
-        output: gets a folder per generator.
-        prefix: of ROS, where the templates are.
-        shares: the share folders of packages that it may refer to, by name.
+        folder: of the package.
+        files: interface files, relative to the folder.
+        output: for a folder of each generator.
+        prefix: of ROS, which has the templates.
+        shares: by name, share folders of packages that the files may refer to.
     """
 
     package: str
@@ -41,17 +41,17 @@ class Order:
     shares: dict[str, str]
 
     def text(self) -> str:
-        """For standard input."""
+        """JSON for standard input."""
         return json.dumps(asdict(self))
 
 
 def generated(output: Path, generator: str, package: str) -> Path:
-    """The folder of the files that a generator makes of a package."""
+    """The folder of the files that a generator makes for a package."""
     return output / generator / package
 
 
 def describe(order: Order) -> Arguments:
-    """Translate the definitions, and describe each type with its hash (REP 2011)."""
+    """Translate definitions to IDL, and write descriptions and hashes of types (REP 2011)."""
     from rosidl_adapter import convert_to_idl
     from rosidl_generator_type_description import generate_type_hash
 
@@ -92,17 +92,17 @@ def generate(order: Order) -> None:
 
 
 class Arguments:
-    """The files in which generators expect their arguments, and what they expect to be there.
+    """Files with the arguments of generators, and other files and folders that these expect.
 
     Attributes:
-        idl: the translated definitions, relative to their folder.
+        idl: the IDL files, relative to their folder.
     """
 
     def __init__(self, order: Order, idl: Sequence[Path]) -> None:
         self._order, self.idl = order, tuple(idl)
 
     def file(self, generator: str, **more: Any) -> str:
-        """The path of the file for a generator; ``more`` is what only this one takes."""
+        """Write the arguments of a generator, ``more`` of its own among them; returns the path."""
         from rosidl_cli.command.helpers import generate_visibility_control_file
 
         order = self._order

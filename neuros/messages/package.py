@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ KINDS = ("msg", "srv", "action")
 """The folders of interfaces, which are also the suffixes of the files in them."""
 
 _LONGEST_NAME = 200
-"""Names of files, which have at most 255 bytes, contain the name of a package and up to 50 more."""
+"""Names of files have at most 255 bytes: the name of a package, and up to 50 more."""
 
 _IGNORED = ("COLCON_IGNORE", "AMENT_IGNORE", "CATKIN_IGNORE")
 _NOT_SOURCES = {"build", "install", "log"}
@@ -26,9 +26,9 @@ class Package:
     """A package with interfaces.
 
     Attributes:
-        folder: the one with its ``package.xml``.
+        folder: holds ``package.xml``.
         files: its interface files, relative to the folder: ``msg/Joints.msg``.
-        dependencies: the packages that it names for building.
+        dependencies: packages that the manifest names for building or running.
     """
 
     name: str
@@ -52,14 +52,26 @@ class Package:
 
 
 def find_packages(workspace: Path) -> tuple[list[Package], list[Problem]]:
-    """The packages with interfaces in a folder, and what is wrong with their manifests.
+    """The packages with interfaces in a folder, and the mistakes in their manifests.
 
-    Folders with a ``COLCON_IGNORE`` are left out, as are hidden ones and what colcon makes.
+    Hidden folders, those with a ``COLCON_IGNORE``, and those that colcon makes are left out.
     """
     packages: list[Package] = []
     problems: list[Problem] = []
-    for folder in _package_folders(workspace):
-        files = _interface_files(folder)
+    for place, folders, names in os.walk(workspace):
+        if any(name in names for name in _IGNORED):
+            folders.clear()
+            continue
+        if MANIFEST not in names:
+            folders[:] = sorted(f for f in folders if f[0] != "." and f not in _NOT_SOURCES)
+            continue
+        folders.clear()  # packages do not nest
+        folder = Path(place)
+        files = tuple(
+            file.relative_to(folder)
+            for kind in KINDS
+            for file in sorted((folder / kind).glob(f"*.{kind}"))
+        )
         if not files:
             continue
         try:
@@ -77,7 +89,7 @@ def find_packages(workspace: Path) -> tuple[list[Package], list[Problem]]:
 
 
 def problem_at(file: Path, text: str, line: int = 1, column: int = 1, hint: str = "") -> Problem:
-    """A problem at a place in a file that is not JSON; the file as the user may have named it."""
+    """A problem at a place in a file; its path is relative to the current folder, if below it."""
     try:
         shown = file.relative_to(Path.cwd())
     except ValueError:
@@ -91,27 +103,6 @@ class ManifestError(Exception):
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         super().__init__(str(problem))
-
-
-def _package_folders(workspace: Path) -> Iterator[Path]:
-    for place, folders, files in os.walk(workspace):
-        if any(name in files for name in _IGNORED):
-            folders.clear()
-        elif MANIFEST in files:
-            folders.clear()  # packages do not nest
-            yield Path(place)
-        else:
-            folders[:] = sorted(
-                name for name in folders if name[0] != "." and name not in _NOT_SOURCES
-            )
-
-
-def _interface_files(folder: Path) -> tuple[Path, ...]:
-    return tuple(
-        file.relative_to(folder)
-        for kind in KINDS
-        for file in sorted((folder / kind).glob(f"*.{kind}"))
-    )
 
 
 def _read(folder: Path, files: tuple[Path, ...]) -> Package:
@@ -129,7 +120,7 @@ def _read(folder: Path, files: tuple[Path, ...]) -> Package:
         text = " ".join(
             line.strip() for line in lines if not line.startswith("Error(s) in package")
         )
-        line = getattr(error.__context__, "lineno", 1)  # what is missing is in no line
+        line = getattr(error.__context__, "lineno", 1)  # a missing element has no line
         raise ManifestError(problem_at(file, text, int(line))) from error
     if len(manifest.name) > _LONGEST_NAME:
         text = f"the name of the package has {len(manifest.name)} characters, at most"
@@ -143,14 +134,14 @@ class Ros:
     """An installation of ROS: where its headers, libraries and descriptions are.
 
     Attributes:
-        prefix: holds ``include``, ``lib`` and ``share``; for the wheels it is that of their Python.
+        prefix: holds ``include``, ``lib`` and ``share``; for wheels, the prefix of their Python.
     """
 
     prefix: Path
 
     @classmethod
     def here(cls) -> Ros:
-        """The one of this Python."""
+        """The ROS of this Python."""
         return cls(Path(sys.prefix))
 
     @property
@@ -162,12 +153,13 @@ class Ros:
         return self.prefix / "lib"
 
     def share(self, package: str) -> Path:
-        """The folder of a package with its descriptions, which need not be there."""
+        """The folder of the descriptions of a package, which may be missing."""
         return self.prefix / "share" / package
 
     def has(self, package: str) -> bool:
         """Whether a package is installed."""
-        return os.path.isfile(self.share(package) / MANIFEST)  # a name may be too long for a file
+        # Path.is_file() raises for a name that is too long.
+        return os.path.isfile(self.share(package) / MANIFEST)
 
     def messages(self, package: str) -> Collection[str] | None:
         """The names of the messages of a package, ``None`` if there is no such package."""
@@ -180,5 +172,5 @@ class Ros:
         return {folder.parent.name for folder in (self.prefix / "share").glob("*/msg")}
 
     def manifest(self, package: str) -> bytes:
-        """The manifest, which tells versions of a package apart; empty if it is not installed."""
+        """The manifest of a package, which has its version; empty if it is not installed."""
         return (self.share(package) / MANIFEST).read_bytes() if self.has(package) else b""

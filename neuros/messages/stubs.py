@@ -1,8 +1,8 @@
 """Stubs of message classes, so that editors and type checkers know the fields of a packet.
 
-rclpy's classes are made without annotations. A stub file (PEP 561) states what
-``get_fields_and_field_types`` says of each class, and what NeuROS takes for a field: a plain number
-for a number, a list or an array for a sequence of them.
+rclpy's classes have no annotations. A stub file (PEP 561) has the fields of each class, as
+``get_fields_and_field_types`` lists them, with the types that NeuROS accepts for a field: a plain
+number for a number, a list or an array for a sequence of numbers.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from collections.abc import Iterable, Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 from neuros.project.message_types import parts_of_type
 
@@ -26,8 +25,8 @@ _IMPORTS = {
     "ClassVar[": "from typing import ClassVar",
     "np.": "import numpy as np",
 }
-# PEP 484: so the modules that have no stubs, such as srv, are not taken for missing. Pyright asks
-# for a file of each, too.
+# PEP 484: for modules without stubs, such as srv, which checkers would report as missing. Pyright
+# needs a file for each, too.
 _OTHER_MODULES = """\
 # pyright: reportIncompleteStub=false
 from typing import Any
@@ -44,17 +43,17 @@ _IN_ARRAYS = {"int", "float"}
 
 
 def write_stubs(types: Iterable[str], folder: Path) -> list[Path]:
-    """Write the stubs of all packages of these types, and of those that they need.
+    """Write stubs of all packages of these types, and of packages that they need.
 
     Args:
         types: in ROS notation, ``sensor_msgs/msg/Imu``; their packages can be imported.
-        folder: gets a folder for each package.
+        folder: for a folder of each package.
 
     Returns:
         The files.
 
     Raises:
-        OSError: if they cannot be written.
+        OSError: if a file cannot be written.
     """
     wanted = {name.partition("/")[0] for name in types}
     done: dict[str, str] = {}
@@ -86,26 +85,21 @@ def _stub(package: str) -> tuple[str, set[str]]:
     needed = {element.partition("/")[0] for element in elements if "/" in element} - {package}
     text = ""
     for each in classes:
-        lines = [*_constants(each), *_fields(fields[each], package)]
+        constants = getattr(type(each), f"_{type(each).__name__}__constants", {})
+        lines = [f"{n}: ClassVar[{type(value).__name__}]" for n, value in constants.items()]
+        lines += _fields(fields[each], package)
         text += f"\nclass {each.__name__}:\n" + "".join(f"    {line}\n" for line in lines)
     imports = [line for use, line in _IMPORTS.items() if use in text]
     imports += [f"import {each}.msg" for each in sorted(needed)]
     return "\n".join([_HEAD.format(package=package) + "\n".join(imports), text]), needed
 
 
-def _constants(message: Any) -> Iterator[str]:
-    """The constants of a message, which its metaclass has."""
-    made = getattr(type(message), f"_{type(message).__name__}__constants", {})
-    for name, value in made.items():
-        yield f"{name}: ClassVar[{type(value).__name__}]"
-
-
 def _fields(types: dict[str, str], package: str) -> Iterator[str]:
-    """The fields, and the constructor that takes them by name."""
-    taken = []
+    """The lines of the fields, and of the constructor with its keyword arguments."""
+    arguments = []
     for name, kind in types.items():
         read, written = _annotations(kind, package)
-        taken.append(f"{name}: {written} = ...")
+        arguments.append(f"{name}: {written} = ...")
         if read == written:
             yield f"{name}: {read}"
         else:
@@ -113,13 +107,14 @@ def _fields(types: dict[str, str], package: str) -> Iterator[str]:
             yield f"def {name}(self) -> {read}: ..."
             yield f"@{name}.setter"
             yield f"def {name}(self, value: {written}) -> None: ..."
-    yield f"def __init__({', '.join(['self', *(['*', *taken] if taken else [])])}) -> None: ..."
+    keywords = ", ".join(["self", *(["*", *arguments] if arguments else [])])
+    yield f"def __init__({keywords}) -> None: ..."
     yield "@classmethod"
     yield "def get_fields_and_field_types(cls) -> dict[str, str]: ..."
 
 
 def _annotations(kind: str, package: str) -> tuple[str, str]:
-    """What a field is when it is read, and what may be written to it."""
+    """The type of a field when it is read, and the types that it accepts."""
     is_sequence, element, length = parts_of_type(kind)
     if "/" in element:
         of, name = element.split("/")

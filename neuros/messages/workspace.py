@@ -3,16 +3,16 @@
 Built packages are cached::
 
     ~/.cache/neuros/messages/         (or $XDG_CACHE_HOME/neuros/messages)
-        <package>-<key>/              a built package, whole from its first moment
+        <package>-<key>/              a built package, always complete
             python/<package>/         what Python imports
             lib/                      its C libraries
             share/<package>/          definitions, and type descriptions with their hashes
             include/<package>/        headers, for packages that depend on it
         <package>-<key>.lock          only while it is being built
-        <package>-<key>.log           what the generators and the compiler wrote, after a failure
+        <package>-<key>.log           output of the generators and the compiler, after a failure
 
-A package is built in a folder beside, which gets its name when it is whole. The libraries of one
-find those of another by the path between their folders: the cache can be anywhere.
+A package is built in another folder, which is renamed when it is complete. Libraries find those of
+other packages by the relative path between their folders: the cache can be anywhere.
 """
 
 from __future__ import annotations
@@ -23,19 +23,18 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any
 
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.errors import Problem
 from neuros.messages.package import MANIFEST, Package, Ros, find_packages, problem_at
 from neuros.project.message_types import MessageField
 
-_FORMAT = b"1"  # of what is built; another one builds everything anew
+_FORMAT = b"1"  # of built packages; a change builds all packages again
 _ABI = Path(__file__).with_name("stable_abi.h")
 GENERATORS = (
     "rosidl_adapter",
@@ -50,14 +49,14 @@ GENERATORS = (
 
 
 class Workspaces:
-    """The packages with messages in some workspaces; of two with one name the first counts.
+    """The packages with messages in two workspaces; a package of the project hides a shared one.
 
-    Nothing is read before something is asked, and the shared one last: most projects need none.
+    Workspaces are read when they are needed, since most projects need none.
 
     Args:
-        own: the workspace of the project: all its packages are built.
-        shared: the workspace of NeuROS: those that are needed are built.
-        environ: says where built packages are kept.
+        own: the workspace of the project, of which all packages are built.
+        shared: the workspace of NeuROS, of which the needed packages are built.
+        environ: tells the folder of the cache.
     """
 
     def __init__(
@@ -82,22 +81,22 @@ class Workspaces:
 
     @cached_property
     def packages(self) -> dict[str, Package]:
-        """All of them, by name."""
+        """All packages, by name."""
         return {**self._shared.packages, **self._own.packages}
 
     @property
     def own(self) -> set[str]:
-        """The names of those in the project's workspace."""
+        """The names of packages in the workspace of the project."""
         return set(self._own.packages)
 
     @property
     def own_problems(self) -> list[Problem]:
-        """Mistakes in manifests of the project's workspace."""
+        """Mistakes in manifests of the workspace of the project."""
         return self._own.problems
 
     @property
     def problems(self) -> list[Problem]:
-        """Mistakes in manifests."""
+        """Mistakes in manifests of both workspaces."""
         return [*self._own.problems, *self._shared.problems]
 
     def messages(self, package: str) -> Collection[str] | None:
@@ -105,14 +104,14 @@ class Workspaces:
         return self.packages[package].messages if package in self.packages else None
 
     def installed(self, package: str) -> Path | None:
-        """The folder that a package is built into, ``None`` if it is not in a workspace."""
+        """The folder of the build of a package, ``None`` if it is not in a workspace."""
         try:
             return next((b.folder for b in self.builds([package]) if b.package == package), None)
         except CycleError:
             return None
 
     def fields(self, package: str, name: str) -> dict[str, MessageField] | None:
-        """The fields of a message, ``None`` if it is in no workspace, or its file is wrong."""
+        """The fields of a message, ``None`` if it is in no workspace, or its file has mistakes."""
         if name not in (self.messages(package) or ()):
             return None
         from rosidl_adapter.parser import InvalidSpecification, parse_message_file
@@ -121,23 +120,46 @@ class Workspaces:
             file = self.packages[package].folder / "msg" / f"{name}.msg"
             message = parse_message_file(package, file)
         except (OSError, ValueError, TypeError, AssertionError, InvalidSpecification):
-            return None  # the check of message packages says so
-        return {
-            each.name: MessageField(_type_name(each.type), is_array=each.type.is_array)
-            for each in message.fields
-        }
+            return None  # the check of message packages reports it
+        found = {}
+        for each in message.fields:  # of type float64, or geometry_msgs/msg/Vector3
+            declared = each.type
+            package_name = "" if declared.pkg_name is None else f"{declared.pkg_name}/msg/"
+            found[each.name] = MessageField(
+                f"{package_name}{declared.type}", is_array=declared.is_array
+            )
+        return found
 
     def builds(self, names: Iterable[str]) -> list[Built]:
-        """Packages and all that they depend on, built or not, as :meth:`closure` orders them."""
+        """Packages and all that they depend on, built or not, as :meth:`closure` orders them.
+
+        The key of a package changes with its content, with that of the packages that it needs, and
+        with the versions of the generators and of packages of ROS; not with that of Python.
+        """
         packages = self.closure(names)
-        keys = self._keys(packages)
+        tools = b"".join(self.ros.manifest(name) for name in GENERATORS)
+        keys: dict[str, str] = {}
+        for package in packages:
+            digest = hashlib.sha256(_FORMAT + _ABI.read_bytes() + tools)
+            digest.update(platform.machine().encode())
+            for file in (Path(MANIFEST), *package.files):
+                try:
+                    content = (package.folder / file).read_bytes()
+                    content = f"{len(content)}\0".encode() + content
+                except OSError:
+                    content = b"unreadable"  # the check of message packages reports it
+                digest.update(f"{file.as_posix()}\0".encode() + content)
+            for name in sorted(package.dependencies):
+                there = keys[name].encode() if name in keys else self.ros.manifest(name)
+                digest.update(f"{name}\0{len(there)}\0".encode() + there)
+            keys[package.name] = digest.hexdigest()[:KEY_LENGTH]
         return [Built(self._cache / f"{p.name}-{keys[p.name]}") for p in packages]
 
     def closure(self, names: Iterable[str]) -> list[Package]:
-        """Packages and all that they depend on, each after those that it needs.
+        """Packages and all that they depend on, each after the packages that it needs.
 
         Raises:
-            CycleError: if there is no such order.
+            CycleError: if packages need each other.
         """
         graph: dict[str, set[str]] = {}
         pending = [name for name in names if name in self.packages]
@@ -150,35 +172,8 @@ class Workspaces:
         return [self.packages[name] for name in sorter.static_order()]
 
     def needs(self, name: str) -> list[str]:
-        """The packages of the workspaces that one of them names."""
+        """The packages of the workspaces that a package depends on."""
         return sorted(self.packages[name].dependencies & set(self.packages) - {name})
-
-    def _keys(self, packages: Sequence[Package]) -> dict[str, str]:
-        """The key of each package.
-
-        It changes with the content of the package, of those that it needs, and with the version
-        of the generators and of ROS's own packages; not with that of Python.
-        """
-        tools = b"".join(self.ros.manifest(name) for name in GENERATORS)
-        keys: dict[str, str] = {}
-        for package in packages:
-            digest = hashlib.sha256(_FORMAT + _ABI.read_bytes() + tools)
-            digest.update(platform.machine().encode())
-            for file in (Path(MANIFEST), *package.files):
-                digest.update(f"{file.as_posix()}\0".encode() + _content(package.folder / file))
-            for name in sorted(package.dependencies):
-                there = keys[name].encode() if name in keys else self.ros.manifest(name)
-                digest.update(f"{name}\0{len(there)}\0".encode() + there)
-            keys[package.name] = digest.hexdigest()[:KEY_LENGTH]
-        return keys
-
-
-def _content(file: Path) -> bytes:
-    try:
-        content = file.read_bytes()
-    except OSError:
-        return b"unreadable"  # checking says so
-    return f"{len(content)}\0".encode() + content
 
 
 @dataclass(frozen=True)
@@ -202,12 +197,6 @@ def cycle_problem(workspaces: Workspaces, error: CycleError) -> Problem:
     return problem_at(package.folder / MANIFEST, text)
 
 
-def _type_name(declared: Any) -> str:
-    """Of a type of rosidl's parser: ``float64``, ``geometry_msgs/msg/Vector3``."""
-    own = str(declared.type)
-    return own if declared.pkg_name is None else f"{declared.pkg_name}/msg/{own}"
-
-
 def message_cache(environ: Mapping[str, str]) -> Path:
     """The folder of built packages."""
     return cache_root(environ) / "messages"
@@ -215,7 +204,7 @@ def message_cache(environ: Mapping[str, str]) -> Path:
 
 @dataclass(frozen=True)
 class Built(Kept):
-    """One package, built or not; the log has what the generators and the compiler wrote."""
+    """The build of one package, which may be missing."""
 
     @property
     def package(self) -> str:
@@ -241,24 +230,20 @@ class Built(Kept):
         return self.folder.is_dir()
 
     def note_use(self) -> None:
-        """Keep it from being removed as unused."""
+        """Keep the build from being removed as unused."""
         with contextlib.suppress(OSError):
             os.utime(self.folder)
 
 
 def sweep(cache: Path) -> None:
-    """Remove what was interrupted, and what no run has used for a month."""
+    """Remove interrupted builds, and builds and logs that are unused for a month."""
     oldest_s = time.time() - UNUSED_S
     for built in map(Built, kept_in(cache)):
         with contextlib.suppress(OSError), built.locked(wait=False) as is_mine:
             if is_mine:
                 shutil.rmtree(built.draft, ignore_errors=True)
-                _remove_if_older(built, oldest_s)
-
-
-def _remove_if_older(built: Built, oldest_s: float) -> None:
-    if built.is_there and built.folder.stat().st_mtime < oldest_s:
-        built.folder.rename(built.draft)  # gone at once: half of it must not count as built
-        shutil.rmtree(built.draft, ignore_errors=True)
-    if built.log.exists() and built.log.stat().st_mtime < oldest_s:
-        built.log.unlink()
+                if built.is_there and built.folder.stat().st_mtime < oldest_s:
+                    built.folder.rename(built.draft)  # half of a folder must not count as built
+                    shutil.rmtree(built.draft, ignore_errors=True)
+                if built.log.exists() and built.log.stat().st_mtime < oldest_s:
+                    built.log.unlink()
