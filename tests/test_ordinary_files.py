@@ -20,7 +20,7 @@ from neuros.ordinary_files import (
 )
 from neuros.recording.bag_writer import BagWriter
 from neuros.recording.recorder import counts_of
-from neuros.recording.recording_plan import Stream, Topic
+from neuros.recording.recording_plan import RecordedStream, Topic
 from neuros.recording.run_file import write_run_file
 from neuros.recording.spool import ListenedSpool, SpoolReader, SpoolWriter
 
@@ -208,7 +208,7 @@ def test_a_node_cannot_have_the_bag_written_elsewhere(run: Path, elsewhere: Path
 @pytest.mark.parametrize("name", ["node", "node/spool"])
 def test_a_node_cannot_have_files_removed_elsewhere(run: Path, elsewhere: Path, name: str) -> None:
     (elsewhere / "spool").symlink_to(elsewhere)
-    spool = SpoolWriter(run / "node", [Stream("sent", "x", (0,))])
+    spool = SpoolWriter(run / "node", [RecordedStream("sent", "x", (0,))])
     spool.keep(0, b"", None)
     spool.close()
     reader = SpoolReader(run / "node")

@@ -15,7 +15,7 @@ from benchmarks.ping_pong import IMU_PACKET, LARGE, Packet
 from benchmarks.subjects.whiskeye import WHISKEYE
 from neuros.backends.sidecars import RecorderProcess
 from neuros.recording.recorder import Recorder
-from neuros.recording.recording_plan import RecordingPlan, Stream, Topic
+from neuros.recording.recording_plan import RecordedStream, RecordingPlan, Topic
 from neuros.recording.spool import SpoolWriter
 
 RECORD = ("-r",)
@@ -121,7 +121,7 @@ def live(size: int, seconds: float) -> dict[str, float]:
     names = "abcd"
     count = round(LIVE_RATE * seconds / len(names))
     topics = tuple(Topic(f"/neuros/{n}/out/z/{n}/data", "std_msgs/msg/String") for n in names)
-    streams = {name: (Stream("sent", "out", (place,)),) for place, name in enumerate(names)}
+    streams = {name: (RecordedStream("sent", "out", (place,)),) for place, name in enumerate(names)}
     plan = RecordingPlan(topics, streams)
     with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
         run = Path(folder)
@@ -149,7 +149,7 @@ def live(size: int, seconds: float) -> dict[str, float]:
 def recorded(size: int, count: int) -> dict[str, float]:
     """Keep packets of a size, and move them into a bag: a node's side, and the recorder's."""
     topic = Topic("/neuros/a/out/b/in/data", "std_msgs/msg/String")
-    plan = RecordingPlan((topic,), {"a": (Stream("sent", "out", (0,)),)})
+    plan = RecordingPlan((topic,), {"a": (RecordedStream("sent", "out", (0,)),)})
     data = bytes(size)
     with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as folder:
         run = Path(folder)

@@ -1,8 +1,8 @@
-"""Lists that nodes of a run have written: times, digests and latencies of packets.
+"""Packet lists of a run, as :mod:`neuros.node.logs` writes them: times, digests, latencies.
 
-Reads what :mod:`neuros.node.logs` writes. Both ends' times are of the monotonic clock
-of one machine, which all its processes share; the two ends of a connection on different machines
-leave their lists in different run folders, and no latency is worked out for them.
+Times are of the monotonic clock of the machine, which all its processes share. If the ends of a
+connection were on different machines, their lists are in different run folders, and it has no
+latency.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ Numbers = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class Packets:
+class PacketLists:
     """The lists of one connection; empty where there are none.
 
     Attributes:
         sent_ns: when each packet was sent, (sent,).
         sent: its digest, (sent,).
-        received: the digest of each that arrived, (received,).
-        taken: of each that a hook started on, its place among those that arrived, from 1, (taken,).
-        taken_ns: when that was, (taken,).
-        pauses_ns: when the receiver stood still, start and end of each pause, (pauses, 2).
-        damaged: files of which the rest is left out, from an entry that no node has written.
-        sent_before, received_before, taken_before: how many entries the node has not kept, which
-            came before the first ones here.
+        received: the digest of each packet that arrived, (received,).
+        taken: for each start of a hook, the place of its packet in ``received``, from 1, (taken,).
+        taken_ns: when the hook started, (taken,).
+        pauses_ns: start and end of each pause of the receiver, (pauses, 2).
+        damaged: files that are left out from an impossible entry on.
+        sent_before, received_before, taken_before: how many entries in front of the lists the node
+            has not kept.
     """
 
     sent_ns: Numbers
@@ -56,29 +56,30 @@ class Packets:
 
     @property
     def before(self) -> int:
-        """How many of the first packets some list has not kept; 0: all lists are from the start."""
+        """How many of the first packets some list lacks; 0: all lists are complete at the start."""
         return max(self.sent_before, self.received_before, self.taken_before)
 
     @property
     def consumed(self) -> Numbers:
-        """The digests of the packets that hooks have started on, each once, in order."""
+        """The digests of the packets that hooks have started on, each once, in order, (n,)."""
         places = np.unique(self.taken) - self.received_before
         found: Numbers = self.received[places[_is_in(self.received, places)] - 1]
         return found
 
     @property
     def consumed_ns(self) -> Numbers:
-        """When the first hook has started on each packet of :attr:`consumed`."""
+        """When the first hook has started on each packet of :attr:`consumed`, (n,)."""
         places, firsts = np.unique(self.taken, return_index=True)
         is_known = _is_in(self.received, places - self.received_before)
         found: Numbers = self.taken_ns[firsts[is_known]]
         return found
 
     def flights_ns(self, *, may_lose: bool) -> Numbers | None:
-        """When a packet was sent, and when a hook started on it: for each start, (starts, 2).
+        """For each start of a hook, when its packet was sent and when it started, (starts, 2).
 
-        Where packets may be lost on their way, those that arrived are found by their digests among
-        those that were sent; ``None`` if that is not possible.
+        Args:
+            may_lose: whether packets may be lost on their way. Those that arrived are then found
+                among the sent ones by their digests; ``None`` if that is not possible.
         """
         places, before = self.taken, self.sent_before
         sent_ns, taken_ns = self.sent_ns, self.taken_ns
@@ -92,7 +93,7 @@ class Packets:
         return np.column_stack([sent_ns[places[is_known] - before - 1], taken_ns[is_known]])
 
     def latencies_ns(self, *, may_lose: bool) -> Numbers | None:
-        """Nanoseconds from when a packet was sent to each start of a hook on it, without pauses.
+        """Nanoseconds from sending a packet to each start of a hook on it, without pauses.
 
         ``None`` as from :meth:`flights_ns`.
         """
@@ -108,9 +109,9 @@ class Packets:
         return latencies_ns
 
     def _which_arrived(self) -> Numbers | None:
-        """For each packet that arrived, its place among those that were sent, from 0.
+        """For each packet that arrived, its place in ``sent``, from 0; ``None`` if unknown.
 
-        The first ones that arrived are left out where their sender has not kept them.
+        Without the first ones that arrived, if the sender has not kept their digests.
         """
         order = np.argsort(self.sent)
         ordered = self.sent[order]
@@ -128,8 +129,8 @@ class Packets:
         return order[found[first:]]
 
 
-def read_packets(run_folder: Path, connection: Connection) -> Packets:
-    """The lists of a connection; what a killed node could not write any more is missing."""
+def read_packets(run_folder: Path, connection: Connection) -> PacketLists:
+    """Read the lists of a connection; a killed node has not written the newest entries."""
     index = connection.index
     sender = _node_folder(run_folder, connection.source_node) / FOLDER
     receiver = _node_folder(run_folder, connection.destination_node) / FOLDER
@@ -144,7 +145,7 @@ def read_packets(run_folder: Path, connection: Connection) -> Packets:
         _list(sender / f"{index}.sent_ns", np.int64), _list(sender / f"{index}.digests", np.uint64)
     )
     received_before, received = _list(receiver / f"{index}.digests", np.uint64)
-    return Packets(
+    return PacketLists(
         sent_ns=sent_ns,
         sent=sent,
         received=received,
@@ -159,16 +160,16 @@ def read_packets(run_folder: Path, connection: Connection) -> Packets:
 
 
 def _beside(*lists: tuple[int, Numbers]) -> tuple[int, list[Numbers]]:
-    """Lists of the same packets from the first one that all have; not all need be kept."""
+    """Lists of the same packets, from the first packet that all of them have."""
     before = max((before for before, numbers in lists if len(numbers)), default=0)
     return before, [numbers[before - its_before :] for its_before, numbers in lists]
 
 
 def _list(file: Path, kind: Any) -> tuple[int, Numbers]:
-    """How many entries of a list were not kept, and the others; of files without a gap."""
+    """How many entries of a list were not kept, and the kept ones, up to a missing file."""
     found, end = [numbers_of(file, kind)], 0
     before = 0
-    if not len(found[0]):  # it has gone, or there never was one
+    if not len(found[0]):  # the first file was removed, or never written
         names = (
             each.name.removeprefix(f"{file.name}.") for each in file.parent.glob(f"{file.name}.*")
         )
@@ -188,47 +189,41 @@ def _node_folder(run_folder: Path, node: str) -> Path:
     return next(run_folder.glob(f"*/{node}"), own)
 
 
-def packet_figures(packets: Packets, *, may_lose: bool) -> dict[str, Any]:
+def packet_figures(packets: PacketLists, *, may_lose: bool) -> dict[str, Any]:
     """Latency and digests of a connection, ready for JSON.
 
-    ``latency_ms`` is ``None`` where it cannot be told, ``digests`` where none were kept, or not
-    those of the first packets.
+    ``latency_ms`` is ``None`` where it is not known, ``digests`` where those of all packets, or of
+    the first ones, were not kept.
     """
-    return {"latency_ms": _latency_ms(packets, may_lose), "digests": _digests(packets)}
-
-
-def _latency_ms(packets: Packets, may_lose: bool) -> dict[str, float] | None:
+    latency_ms: dict[str, float] | None = None
     latencies_ns = packets.latencies_ns(may_lose=may_lose)
-    if latencies_ns is None or not len(latencies_ns):
-        return None
-    percentiles = np.percentile(latencies_ns, PERCENTILES) / 1e6
-    return {
-        **{f"p{p}": float(ms) for p, ms in zip(PERCENTILES, percentiles, strict=True)},
-        "max": float(latencies_ns.max()) / 1e6,
-        "count": len(latencies_ns),
-    }
-
-
-def _digests(packets: Packets) -> dict[str, Any] | None:
-    if not (len(packets.sent) or len(packets.received)) or packets.before:
-        return None
-    consumed = packets.consumed
-    return {
-        "sent": xxh3_128_hexdigest(packets.sent.tobytes()),
-        "sent_packets": len(packets.sent),
-        "consumed": xxh3_128_hexdigest(consumed.tobytes()),
-        "consumed_packets": len(consumed),
-    }
+    if latencies_ns is not None and len(latencies_ns):
+        percentiles = np.percentile(latencies_ns, PERCENTILES) / 1e6
+        latency_ms = {
+            **{f"p{p}": float(ms) for p, ms in zip(PERCENTILES, percentiles, strict=True)},
+            "max": float(latencies_ns.max()) / 1e6,
+            "count": len(latencies_ns),
+        }
+    digests: dict[str, Any] | None = None
+    if (len(packets.sent) or len(packets.received)) and not packets.before:
+        consumed = packets.consumed
+        digests = {
+            "sent": xxh3_128_hexdigest(packets.sent.tobytes()),
+            "sent_packets": len(packets.sent),
+            "consumed": xxh3_128_hexdigest(consumed.tobytes()),
+            "consumed_packets": len(consumed),
+        }
+    return {"latency_ms": latency_ms, "digests": digests}
 
 
 def may_have_lost(figures: Mapping[str, Any]) -> bool:
-    """Whether packets of a connection, from ``run.json``, may have been lost on their way."""
+    """Whether a connection, from ``run.json``, may have lost packets on their way."""
     is_best_effort = figures.get("discard_limit") is None
     return is_best_effort and figures.get("sent") != figures.get("received")
 
 
 def _is_in(numbers: Numbers, places: Numbers) -> Numbers:
-    """Which places, from 1, are of one of the numbers."""
+    """Which places, from 1, are inside of the numbers."""
     found: Numbers = (places >= 1) & (places <= len(numbers))
     return found
 
@@ -239,10 +234,10 @@ def up_to_first(wrong: Numbers) -> int:
 
 
 def numbers_of(file: Path, kind: Any, columns: int = 1) -> Numbers:
-    """All complete rows; one number in each makes an array of one dimension."""
+    """The complete rows of 64-bit numbers in a file, (rows, columns), or (rows,) of one column."""
     try:
         data = read_bytes(file)
-    except OSError:  # the node has sent, or received, nothing
+    except OSError:  # the node has sent or received nothing
         data = b""
     found = np.frombuffer(data[: len(data) // (8 * columns) * 8 * columns], dtype=kind)
     return found if columns == 1 else found.reshape(-1, columns)

@@ -16,7 +16,7 @@ from neuros.options import option, options_of, positive_number, positive_seconds
 from neuros.project.model import bytes_of
 
 if TYPE_CHECKING:
-    from neuros.recording.recording_plan import Request as RecordingRequest
+    from neuros.recording.recording_plan import RecordingRequest
 
 _RECORDING = "recording: NAME is a topic, an output (node.output) or a connection; * stands for any"
 
@@ -62,7 +62,7 @@ class Request(ProjectOptions):
     """How to run a project.
 
     Raises:
-        UsageError: for values that make no sense.
+        UsageError: for wrong values.
     """
 
     nodes: Sequence[str] = option(
@@ -251,7 +251,7 @@ class Request(ProjectOptions):
                 object.__setattr__(self, each.name, (given,))
             elif given is None and each.variable:
                 object.__setattr__(self, each.name, each.value(None))
-        _ = self.end, self.recording, self.packet_log_bytes  # raise what is wrong with them
+        _ = self.end, self.recording, self.packet_log_bytes  # to raise their errors
 
     @property
     def end(self) -> Duration:
@@ -260,7 +260,7 @@ class Request(ProjectOptions):
 
     @property
     def packet_log_bytes(self) -> int:
-        """So much the packet logs of all nodes have together at most; 0: none is kept."""
+        """The largest size of all packet logs of the run, in bytes; 0: none is kept."""
         if self.packet_log == "0" and self.digests:
             raise UsageError("--digests: --packet-log 0 keeps no digests; leave one of them out")
         try:
@@ -273,7 +273,7 @@ class Request(ProjectOptions):
 
     @property
     def recording(self) -> RecordingRequest | None:
-        """What is recorded, ``None``: nothing."""
+        """The request for a recording, ``None``: nothing is recorded."""
         everything = self.record is True
         named = () if isinstance(self.record, bool) else self.record
         topics = (*((named,) if isinstance(named, str) else named), *self.topics)
@@ -281,7 +281,7 @@ class Request(ProjectOptions):
             if self.exclude:
                 raise UsageError("--exclude: nothing is recorded; add -r, or name topics with -t")
             return None
-        from neuros.recording.recording_plan import Request as RecordingRequest
+        from neuros.recording.recording_plan import RecordingRequest
 
         return RecordingRequest(everything, topics, tuple(self.exclude), self.flush_interval)
 
@@ -300,14 +300,14 @@ class LaunchOptions(Request):
 
 @dataclass(frozen=True)
 class Duration:
-    """How long a run lasts: wall seconds, or simulated seconds; neither: until it ends itself."""
+    """Length of a run in wall or simulated seconds; without either, nodes end the run."""
 
     wall_s: float | None = None
     sim_s: float | None = None
 
 
 def parse_duration(given: float | str | None) -> Duration:
-    """``30``, ``0.5``, or ``30sim``.
+    """Parse ``30``, ``0.5``, or ``30sim``.
 
     Raises:
         UsageError: for anything else.

@@ -1,6 +1,6 @@
 """Comparison of two runs, packet by packet.
 
-Packets are compared by the lists of nodes, and where nodes have kept no digests, from bags.
+Packets are compared by the digests that nodes have kept, else by those of packets in bags.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from xxhash import xxh3_64_intdigest
 
-from neuros.api.packets import Numbers, Packets, read_packets
+from neuros.api.packets import Numbers, PacketLists, read_packets
 from neuros.api.run_record import PastRun
 from neuros.bag import Bag, RecordedTopic, open_bag
 from neuros.errors import NeurosError
@@ -22,14 +22,14 @@ from neuros.recording.recording_plan import PLAN_NAME
 from neuros.recording.stored import stored_messages
 
 _LARGE_BYTES = 64 * 1024
-"""The buffers of larger messages travel beside them, and nodes digest them apart."""
+"""From this size on, the buffers of a message travel beside it; nodes digest them apart."""
 
 
 class RecordedPackets:
     """Bags of runs.
 
     Attributes:
-        remarks: why a bag could not be read, a sentence each.
+        remarks: a sentence for each bag that could not be read.
     """
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class RecordedPackets:
         return None if found is None else found[0]
 
     def are_as_of_nodes(self, run: Path, connection: str) -> bool:
-        """Whether nodes digest them alike: small messages, which travel whole."""
+        """Whether nodes compute the same digests: all messages are small, and travel whole."""
         found = self._digests_of(run, connection)
         return found is not None and found[1]
 
@@ -81,7 +81,7 @@ class RecordedPackets:
 
 
 def _digests(bag: Bag) -> dict[str, tuple[Numbers, bool]]:
-    """By topic, digests in the order in which packets were sent, and whether all are small."""
+    """By topic, digests in the order of sending, and whether all packets are small."""
     times: dict[str, array[int]] = {}
     digests: dict[str, array[int]] = {}
     large: set[str] = set()
@@ -101,14 +101,14 @@ def _digests(bag: Bag) -> dict[str, tuple[Numbers, bool]]:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class RunComparison:
     """Result of a comparison.
 
     Attributes:
-        difference: where the runs parted first, in a sentence; ``None`` if they are identical.
-        remarks: what differs and may, and what could not be compared.
+        difference: the first difference in time, in a sentence; ``None`` if there is none.
+        remarks: differences that are allowed, and what could not be compared.
         compared: packets that were found equal.
-        consumed_differently: connections that carried the same packets, of which hooks took others.
+        consumed_differently: connections with equal packets, of which hooks consumed others.
         not_compared: connections of which not all packets could be compared.
     """
 
@@ -121,9 +121,11 @@ class Verdict:
 
 @dataclass(frozen=True)
 class _Difference:
-    """One connection on which they part; ``at_ns`` (in run A) tells which was the first.
+    """The first difference on one connection.
 
-    ``packet``: the connection and the number of the first packet that differs, from 1.
+    Attributes:
+        at_ns: when the packet was sent or consumed in run A.
+        packet: the connection, and the number of the packet that differs, from 1.
     """
 
     at_ns: float
@@ -131,99 +133,125 @@ class _Difference:
     packet: tuple[str, int] | None = None
 
 
-def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> Verdict:
-    """Compare what was sent on every connection, and what hooks took of it.
+def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> RunComparison:
+    """Compare what was sent on every connection, and what hooks consumed.
 
-    Where nodes have kept no digests, packets are taken from the bags of the runs. Of connections
-    that may lose packets it depends on the moment which ones hooks get: that is told apart.
+    Where nodes have kept no digests, those of the bags of the runs are compared. Which packets
+    hooks consume of a connection that may lose packets depends on timing: such a difference is
+    only a remark.
     """
-    found: list[_Difference] = []
-    remarks: list[str] = []
-    differing: list[str] = []
-    incomplete: list[str] = []
-    compared = 0
-    names = [*a.connections, *(name for name in b.connections if name not in a.connections)]
-    for name in names:
-        if name not in a.connections or name not in b.connections:
+    comparer = _Comparer((a, b), recorded)
+    for name in dict.fromkeys([*a.connections, *b.connections]):
+        if name in a.connections and name in b.connections:
+            comparer.compare(name)
+        else:
             only = "A" if name in a.connections else "B"
-            found.append(_Difference(-1.0, f"{name}: only run {only} has this connection"))
-            continue
-        compared += _compare_connection(
-            name, (a, b), recorded, found, remarks, differing, incomplete
-        )
-    first = min(found, key=lambda difference: difference.at_ns, default=None)
-    others = len(found) - 1
-    if others > 0:
-        differ = "connections differ" if others > 1 else "connection differs"
-        remarks.append(f"{others} more {differ}, from a later moment on")
-    text = None if first is None else first.text
-    if first is not None and first.packet is not None:  # a bag is read for the first one only
-        text = f"{first.text} {_field((a.folder, b.folder), *first.packet, recorded)}"
-    return Verdict(text, tuple(remarks), compared, tuple(differing), tuple(incomplete))
+            text = f"{name}: only run {only} has this connection"
+            comparer.differences.append(_Difference(-1.0, text))
+    return comparer.result()
 
 
-def _compare_connection(
-    name: str,
-    runs: tuple[PastRun, PastRun],
-    recorded: RecordedPackets,
-    found: list[_Difference],
-    remarks: list[str],
-    differing: list[str],
-    incomplete: list[str],
-) -> int:
-    """Returns how many packets were found equal; adds to the four lists."""
-    a, b = runs
-    in_a, in_b = _packets(name, runs, recorded)
-    sent = [(run.connections[name]["sent"], p) for run, p in ((a, in_a), (b, in_b))]
-    lacking = [_lacks_digests(*each) for each in sent]
-    if any(lacking):
-        incomplete.append(name)
-        folders = [run.folder for run, lacks in zip(runs, lacking, strict=True) if lacks]
-        remarks.append(
-            f"{name}: not compared, since {' and '.join(dict.fromkeys(map(str, folders)))} has"
-            " neither digests nor a recording of it (the in-process back end keeps digests with"
-            " --digests, and none are kept with --packet-log 0; packets from a node to itself never"
-            " have any: record them with -r)"
+class _Comparer:
+    """Compares two runs, connection by connection."""
+
+    def __init__(self, runs: tuple[PastRun, PastRun], recorded: RecordedPackets) -> None:
+        self._runs = runs
+        self._recorded = recorded
+        self.differences: list[_Difference] = []
+        self._remarks: list[str] = []
+        self._consumed_differently: list[str] = []
+        self._not_compared: list[str] = []
+        self._compared = 0
+
+    def result(self) -> RunComparison:
+        text = None
+        if self.differences:
+            first = min(self.differences, key=lambda difference: difference.at_ns)
+            text = first.text
+            others = len(self.differences) - 1
+            if others:
+                differ = "connections differ" if others > 1 else "connection differs"
+                self._remarks.append(f"{others} more {differ}, from a later moment on")
+            if first.packet is not None:  # a bag is read for the first difference only
+                messages = [self._recorded.message(run.folder, *first.packet) for run in self._runs]
+                if None in messages:
+                    text += " (to see in which field, run both with --record)"
+                else:
+                    field = next(differing_fields(*messages), None)
+                    text += f" in {field}" if field else " (but no recorded field does)"
+        return RunComparison(
+            text,
+            tuple(self._remarks),
+            self._compared,
+            tuple(self._consumed_differently),
+            tuple(self._not_compared),
         )
-        return 0
-    both = in_a, in_b
-    start = max(packets.sent_before for packets in both)
-    ends = [packets.sent_before + len(packets.sent) for packets in both]
-    cut_off = [end for (count, _), end in zip(sent, ends, strict=True) if (count or 0) > end]
-    if start or cut_off:
-        end = max(start, min(cut_off)) if cut_off else None
-        in_a, in_b = (_between(packets, start, end) for packets in both)
-        if start:
-            remarks.append(
-                f"{name}: compared from packet {start + 1} on; the first {start} are not kept"
-                " (--packet-log), nor is it compared what hooks took"
+
+    def compare(self, name: str) -> None:
+        """Compare the packets of a connection that both runs have."""
+        both = _packets(name, self._runs, self._recorded)
+        counts = [run.connections[name]["sent"] for run in self._runs]
+        lacking = [
+            str(run.folder)
+            for run, count, packets in zip(self._runs, counts, both, strict=True)
+            if _lacks_digests(count, packets)
+        ]
+        if lacking:
+            self._not_compared.append(name)
+            self._remarks.append(
+                f"{name}: not compared, since {' and '.join(dict.fromkeys(lacking))} has"
+                " neither digests nor a recording of it (the in-process back end keeps digests with"
+                " --digests, and none are kept with --packet-log 0; packets from a node to itself"
+                " never have any: record them with -r)"
             )
-        if cut_off:
-            remarks.append(f"{name}: compared up to packet {end}; later packets have no digests")
-    compared = _first_difference(in_a.sent, in_b.sent)
-    if cut_off or in_a.before or in_b.before:
-        incomplete.append(name)
-        taken = _counted(name, runs)
-    else:
-        taken = _taken(name, in_a, in_b) or _counted(name, runs)
-    difference = _sent(name, in_a, in_b)
-    if difference is not None:
-        found.append(difference)
-    elif taken is not None and a.connections[name]["discard_limit"] == 0:
-        found.append(taken)
-    elif taken is not None:
-        differing.append(name)
-        remarks.append(f"{taken.text}: this connection may lose packets")
-    return compared
+            return
+        start = max(packets.sent_before for packets in both)
+        ends = [packets.sent_before + len(packets.sent) for packets in both]
+        cut_off = [end for count, end in zip(counts, ends, strict=True) if (count or 0) > end]
+        in_a, in_b = both
+        if start or cut_off:
+            end = max(start, min(cut_off)) if cut_off else None
+            in_a, in_b = (_between(packets, start, end) for packets in both)
+            if start:
+                self._remarks.append(
+                    f"{name}: compared from packet {start + 1} on; the first {start} are not kept"
+                    " (--packet-log), nor is it compared what hooks took"
+                )
+            if cut_off:
+                self._remarks.append(
+                    f"{name}: compared up to packet {end}; later packets have no digests"
+                )
+        self._compared += _first_difference(in_a.sent, in_b.sent)
+        consumed = None
+        if cut_off or in_a.before or in_b.before:
+            self._not_compared.append(name)
+        else:
+            consumed = _consumed(name, in_a, in_b)
+        consumed = consumed or self._counted(name)
+        sent = _sent(name, in_a, in_b)
+        if sent is not None:
+            self.differences.append(sent)
+        elif consumed is not None and self._runs[0].connections[name]["discard_limit"] == 0:
+            self.differences.append(consumed)
+        elif consumed is not None:
+            self._consumed_differently.append(name)
+            self._remarks.append(f"{consumed.text}: this connection may lose packets")
+
+    def _counted(self, name: str) -> _Difference | None:
+        """The difference between the counters of both runs, where no lists tell it."""
+        a, b = (run.connections[name].get("consumed") for run in self._runs)
+        if a is None or b is None or a == b:
+            return None
+        return _Difference(np.inf, f"{name}: hooks took {a} packets in run A, and {b} in run B")
 
 
 def _packets(
     name: str, runs: tuple[PastRun, PastRun], recorded: RecordedPackets
-) -> tuple[Packets, Packets]:
+) -> tuple[PacketLists, PacketLists]:
     """The lists of both runs, with digests from their bags where nodes have kept none.
 
-    If one run has digests of its nodes and the other only a bag, both are taken from bags, where
-    both have one; a bag stands beside digests of nodes only where both digest packets alike.
+    If both runs have a bag, and one of them no digests of nodes, both digests are of bags. Digests
+    of a bag are compared with those of nodes only if all messages are small.
     """
     packets = [read_packets(run.folder, run.ends[name]) for run in runs]
     lacks = [
@@ -237,21 +265,21 @@ def _packets(
     for place, (run, bag) in enumerate(zip(runs, bags, strict=True)):
         stands_beside = lacks[place] and recorded.are_as_of_nodes(run.folder, name)
         if bag is not None and (have_both or stands_beside):
-            # On a reliable connection all of it arrives.
+            # On a reliable connection all packets arrive.
             received = bag if runs[0].ends[name].is_reliable else packets[place].received
             packets[place] = replace(packets[place], sent=bag, received=received, sent_before=0)
     return packets[0], packets[1]
 
 
-def _lacks_digests(sent: int | None, packets: Packets) -> bool:
-    """Whether packets have passed, or may have, of which nothing is known here."""
-    if sent is None:  # by a node of another launcher, or one that never reported
+def _lacks_digests(sent: int | None, packets: PacketLists) -> bool:
+    """Whether packets were sent, or may have been, of which no digest is known."""
+    if sent is None:  # by a node of another launcher, or by one that never reported
         return not len(packets.sent) and not len(packets.received)
     return sent > 0 and not len(packets.sent)
 
 
-def _between(packets: Packets, start: int, end: int | None) -> Packets:
-    """Without what was sent before, or from ``end`` on; both count from 0."""
+def _between(packets: PacketLists, start: int, end: int | None) -> PacketLists:
+    """The packets sent from ``start`` up to before ``end``, counted from 0."""
     first = start - packets.sent_before
     count = None if end is None else first + end - start
     return replace(
@@ -262,7 +290,7 @@ def _between(packets: Packets, start: int, end: int | None) -> Packets:
     )
 
 
-def _sent(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
+def _sent(name: str, in_a: PacketLists, in_b: PacketLists) -> _Difference | None:
     place = _first_difference(in_a.sent, in_b.sent)
     if place == len(in_a.sent) == len(in_b.sent):
         return None
@@ -276,16 +304,7 @@ def _sent(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     return _Difference(at_ns, f"{name}: packet {number + 1} differs", (name, number + 1))
 
 
-def _field(folders: tuple[Path, Path], name: str, number: int, recorded: RecordedPackets) -> str:
-    """In which field a packet differs, as far as it was recorded."""
-    messages = [recorded.message(folder, name, number) for folder in folders]
-    if None in messages:
-        return "(to see in which field, run both with --record)"
-    field = next(differing_fields(*messages), None)
-    return f"in {field}" if field else "(but no recorded field does)"
-
-
-def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
+def _consumed(name: str, in_a: PacketLists, in_b: PacketLists) -> _Difference | None:
     a, b = in_a.consumed, in_b.consumed
     place = _first_difference(a, b)
     if place == len(a) == len(b):
@@ -298,16 +317,8 @@ def _taken(name: str, in_a: Packets, in_b: Packets) -> _Difference | None:
     return _Difference(at_ns, f"{name}: {what}")
 
 
-def _counted(name: str, runs: tuple[PastRun, PastRun]) -> _Difference | None:
-    """What the counters of both runs say where there are no lists of what hooks took."""
-    a, b = (run.connections[name].get("consumed") for run in runs)
-    if a is None or b is None or a == b:
-        return None
-    return _Difference(np.inf, f"{name}: hooks took {a} packets in run A, and {b} in run B")
-
-
 def _first_difference(a: Numbers, b: Numbers) -> int:
-    """The first place at which they differ, from 0; where one ends, at the latest."""
+    """The first place at which the numbers differ, from 0; at the latest the end of the shorter."""
     common = min(len(a), len(b))
     unequal = np.flatnonzero(a[:common] != b[:common])
     return int(unequal[0]) if len(unequal) else common
@@ -316,7 +327,7 @@ def _first_difference(a: Numbers, b: Numbers) -> int:
 def differing_fields(
     a: Any, b: Any, name: str = "", sides: tuple[str, str] = ("A", "B")
 ) -> Iterator[str]:
-    """Differences between two messages of a type: ``header.stamp.sec: 3 in A, 4 in B``."""
+    """Differences between two messages of one type: ``header.stamp.sec: 3 in A, 4 in B``."""
     fields = getattr(a, "__dataclass_fields__", None)
     if fields:
         for field in fields:
@@ -331,11 +342,11 @@ def differing_fields(
         for place, (left, right) in enumerate(zip(a, b, strict=True)):
             yield from differing_fields(left, right, f"{name}[{place}]", sides)
         return
-    if not (a == b or (a != a and b != b)):  # NaN is what it was
+    if not (a == b or (a != a and b != b)):  # NaN equals NaN here
         left, right = _plain(a), _plain(b)
         yield f"{name}: {left!r} in {sides[0]}, {right!r} in {sides[1]}"
 
 
 def _plain(value: Any) -> Any:
-    """A number of NumPy as Python's own, which is shown without its type."""
+    """A number of NumPy as one of Python, whose ``repr`` does not show the type."""
     return value.item() if isinstance(value, np.generic) else value

@@ -1,8 +1,8 @@
 """Writer of the bag of a run: a rosbag2 folder (version 9) with one MCAP file.
 
-The file holds the definitions of its message types, so that it can be read where they are not
-installed. Its index and ``metadata.yaml`` are written at the end; before that, all packets up to
-the last flush can be read from its beginning (:mod:`neuros.recording.stored`).
+The file holds the definitions of its message types, so that machines without them can read it. Its
+index and ``metadata.yaml`` are written at the end; :mod:`neuros.recording.stored` reads a file
+without them up to the last flush.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ _FOREVER = {"sec": 9223372036, "nsec": 854775807}  # as rmw has it for "no deadl
 
 
 def define(type_name: str, store: Typestore) -> None:
-    """Add an installed type to the store, and all types of its fields.
+    """Add an installed message type, and all types of its fields, to the store.
 
     Raises:
-        EnvironmentFault: if no definition of one of them is found.
+        EnvironmentFault: if a definition is missing.
     """
     if type_name in store.fielddefs:
         return
     is_type = normalised(type_name) == type_name
     folder = message_folder(type_name.split("/")[0]) if is_type else None
-    # The share folder is some folders above.
+    # In ROS and in a wheel, the share folder is some folders above the module.
     shares = (above / "share" / f"{type_name}.msg" for above in folder.parents) if folder else ()
     path = next(filter(Path.is_file, shares), None)
     if path is None:
@@ -76,7 +76,7 @@ class BagWriter:
         custom: custom data for its metadata.
 
     Attributes:
-        counts: by number of the topic, the messages.
+        counts: messages by the number of their topic.
 
     Raises:
         OSError: if it cannot be written.
@@ -88,7 +88,7 @@ class BagWriter:
         self._path, self._custom = path, dict(custom)
         with folder_in(path.parent, path.name) as folder:
             self._file = (folder / f"{path.name}.mcap").open("xb")
-        # Compressing images took 2.7 times the processor time, for 0.6 times the size.
+        # Compression of images took 2.7 times the processor time, for 0.6 times the size.
         self._mcap = Writer(self._file, compression=CompressionType.NONE)
         self._mcap.start("ros2", f"neuros-{__version__}")
         self._types = get_typestore(Stores.ROS2_JAZZY)
@@ -143,7 +143,7 @@ class BagWriter:
         self._first_ns, self._last_ns = min(self._first_ns, log_ns), max(self._last_ns, log_ns)
 
     def flush(self) -> None:
-        """Bring all messages to the disk, for the case of a power failure. Raises ``OSError``."""
+        """Write all messages to the disk, against a power failure. Raises ``OSError``."""
         self._mcap.flush()
         os.fdatasync(self._file.fileno())
 
@@ -181,8 +181,8 @@ class BagWriter:
             self.shut()
 
     def shut(self) -> None:
-        """Leave the bag as it is."""
-        with contextlib.suppress(OSError):  # a full disk, which was reported before
+        """Close the file without completing the bag."""
+        with contextlib.suppress(OSError):  # the disk is full, which was reported before
             self._file.close()
 
 

@@ -1,9 +1,9 @@
 """Recorded messages as columns of NumPy.
 
-NumPy takes columns from the bytes of messages. In messages of fixed size, a number is always at the
-same place; in those with strings and sequences, it depends on their lengths, and most topics repeat
-a few lengths for ever, as of a ``frame_id``. So a layout is worked out from one message, and serves
-all that have the same lengths (plain CDR: OMG DDSI-RTPS 2.5, 10.2).
+NumPy reads columns from the bytes of messages. The place of a number depends on the lengths of
+strings and sequences in front of it, and most topics repeat a few lengths, as of a ``frame_id``. So
+a layout is computed from one message, and serves all messages with the same lengths (plain CDR: OMG
+DDSI-RTPS 2.5, 10.2).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class _Irregular(Exception):
 
 
 class _Layout:
-    """The places in a message, counted from its beginning, and in all with the same lengths.
+    """The places of fields in a message, in bytes from its start, for all with the same lengths.
 
     Args:
         types: the field definitions of a ``rosbags`` type store.
@@ -60,10 +60,10 @@ class _Layout:
     Attributes:
         numbers: name, NumPy type (with its shape) and place of each number or row of numbers.
         texts: name, place and length of each string.
-        lengths: places of the lengths that all this depends on.
+        lengths: places of the lengths of strings and sequences.
 
     Raises:
-        _Irregular: if the message has none.
+        _Irregular: if the message has no layout.
     """
 
     def __init__(self, data: bytes, type_name: str, types: Mapping[str, Any]) -> None:
@@ -81,22 +81,18 @@ class _Layout:
         for name, (kind, details) in self._types[type_name][1]:
             if name.startswith(_EMPTY):
                 self._at += 1
+            elif kind.value == _BASE and details[0] == "string":
+                size = self._length()
+                self.texts.append((f"{prefix}{name}", self._at, max(0, size - 1)))
+                self._at += size
             elif kind.value == _BASE:
-                self._base(f"{prefix}{name}", details[0])
+                self._number(f"{prefix}{name}", details[0], ())
             elif kind.value == _NAME:
                 self._message(details, f"{prefix}{name}.")
             elif kind.value == _ARRAY:
                 self._row(f"{prefix}{name}", details[0], details[1], is_array=True)
             else:
                 self._row(f"{prefix}{name}", details[0], self._length(), is_array=False)
-
-    def _base(self, name: str, type_name: str) -> None:
-        if type_name == "string":
-            size = self._length()
-            self.texts.append((name, self._at, max(0, size - 1)))
-            self._at += size
-        else:
-            self._number(name, type_name, ())
 
     def _row(self, name: str, element: Any, count: int, *, is_array: bool) -> None:
         kind, details = element[0].value, element[1]
@@ -159,13 +155,18 @@ class _Layout:
 def columns_of(packets: Sequence[bytes], type_name: str, store: Typestore) -> dict[str, Column]:
     """One column for each field, with one row for each message.
 
-    Fields of messages within the message have names with dots, ``header.stamp.sec``. Arrays of
-    numbers have a column with more than one dimension; so have sequences, where all are of the same
-    length. Strings are ``str``. What is left (sequences of different length, or of messages) is in
-    a column of objects.
+    Fields of messages within the message have names with dots, ``header.stamp.sec``. The column of
+    an array of numbers has more than one dimension, as has that of sequences of one length. Strings
+    are ``str``. Other fields (sequences of different length, or of messages) are objects.
     """
     if not packets:
-        return _columns_of_none(type_name, store)
+        try:  # the layout of a message whose strings and sequences are empty
+            layout = _Layout(_CDR_HEADER, type_name, store.fielddefs)
+        except _Irregular:
+            ways = fields_of(type_name, store.fielddefs)
+            return {".".join(name for _, name in way): np.empty(0, object) for way in ways}
+        numbers = {name: np.zeros((0, *kind.shape), kind.base) for name, kind, _ in layout.numbers}
+        return numbers | {name: np.zeros(0, "U1") for name, _, _ in layout.texts}
     found: dict[str, list[tuple[npt.NDArray[np.intp], Column]]] = {}
     for rows, columns in _parts(packets, type_name, store):
         for name, column in columns.items():
@@ -173,21 +174,10 @@ def columns_of(packets: Sequence[bytes], type_name: str, store: Typestore) -> di
     return {name: _join(parts, len(packets)) for name, parts in found.items()}
 
 
-def _columns_of_none(type_name: str, store: Typestore) -> dict[str, Column]:
-    """The columns of no message: those of one whose strings and sequences are empty."""
-    try:
-        layout = _Layout(_CDR_HEADER, type_name, store.fielddefs)
-    except _Irregular:
-        ways = fields_of(type_name, store.fielddefs)
-        return {".".join(name for _, name in way): np.empty(0, object) for way in ways}
-    numbers = {name: np.zeros((0, *kind.shape), kind.base) for name, kind, _ in layout.numbers}
-    return numbers | {name: np.zeros(0, "U1") for name, _, _ in layout.texts}
-
-
 def _parts(
     packets: Sequence[bytes], type_name: str, store: Typestore
 ) -> Iterator[tuple[npt.NDArray[np.intp], dict[str, Column]]]:
-    """Groups of messages with the same layout, and those without one in the end."""
+    """Rows and columns of each group of messages with one layout; last, of those without one."""
     sizes = np.fromiter(map(len, packets), dtype=np.intp, count=len(packets))
     rest: list[npt.NDArray[np.intp]] = []
     layouts = 0
@@ -213,7 +203,14 @@ def _parts(
         for row in rows.tolist():
             for name, value in _flat(store.deserialize_cdr(packets[row], type_name), ""):
                 columns.setdefault(name, []).append(value)
-        yield rows, {name: _objects_or_numbers(values) for name, values in columns.items()}
+        made = {}
+        for name, values in columns.items():
+            is_scalar = isinstance(values[0], (bool, int, float, str, np.generic))
+            made[name] = np.array(values) if is_scalar else np.empty(len(values), object)
+            if not is_scalar:  # NumPy would make arrays of several dimensions of rows of one length
+                for place, value in enumerate(values):
+                    made[name][place] = value
+        yield rows, made
 
 
 def _flat(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
@@ -223,15 +220,6 @@ def _flat(message: Any, prefix: str) -> Iterator[tuple[str, Any]]:
             yield from _flat(value, f"{prefix}{name}.")
         elif name != "__msgtype__":
             yield f"{prefix}{name}", value
-
-
-def _objects_or_numbers(values: Sequence[Any]) -> Column:
-    if isinstance(values[0], (bool, int, float, str, np.generic)):
-        return np.array(values)
-    column = np.empty(len(values), object)
-    for place, value in enumerate(values):
-        column[place] = value
-    return column
 
 
 def _join(parts: Sequence[tuple[npt.NDArray[np.intp], Column]], count: int) -> Column:
@@ -250,10 +238,10 @@ def _join(parts: Sequence[tuple[npt.NDArray[np.intp], Column]], count: int) -> C
 
 
 def library(name: str, otherwise: str = "") -> Any:
-    """An optional library.
+    """Import an optional library.
 
     Args:
-        otherwise: what works without it, for the error.
+        otherwise: what works without the library, for the error.
 
     Raises:
         EnvironmentFault: if it is not installed.
@@ -266,14 +254,14 @@ def library(name: str, otherwise: str = "") -> Any:
 
 
 def has_simulated_time(columns: Mapping[str, Column]) -> bool:
-    """Whether packets have another time than that of the wall clock."""
+    """Whether the publish time of packets is not their wall time."""
     return bool(np.any(columns[PUBLISH_TIME] != columns[LOG_TIME]))
 
 
 def fields_of(
     type_name: str, types: Mapping[str, Any], path: tuple[tuple[str, str], ...] = ()
 ) -> Iterator[tuple[tuple[str, str], ...]]:
-    """The way to each field: message types from the outermost on, with the field of each."""
+    """The way to each field: pairs of message type and field, from the outermost type on."""
     for name, (_, details) in types[type_name][1]:
         way = (*path, (type_name, name))
         if isinstance(details, str) and details in types:

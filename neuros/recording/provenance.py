@@ -22,12 +22,12 @@ _VERSIONS = "versions.json"
 
 
 def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) -> dict[str, Any]:
-    """All of it but git's part, ready for JSON.
+    """Provenance without the state of git, ready for JSON.
 
     Args:
-        command: the command line that was given.
-        nodes: of the project: what is called a seed in their environment is listed.
-        run_folder: where nodes have noted their versions.
+        command: the command line.
+        nodes: all nodes of the project.
+        run_folder: has the versions of each node (:func:`note_versions`).
     """
     nodes = list(nodes)
     own = python_versions()
@@ -49,7 +49,7 @@ def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) 
 
 
 def python_versions() -> dict[str, Any]:
-    """Of this Python and of what it finds."""
+    """Versions of this Python and of its packages."""
     return {
         "python": platform.python_version(),
         "executable": sys.executable,
@@ -58,23 +58,21 @@ def python_versions() -> dict[str, Any]:
 
 
 def note_versions(node_folder: Path) -> None:
-    """Leave in a node's folder what the node runs on: a container has a Python of its own."""
-    with contextlib.suppress(OSError):  # of a full disk others complain who lose more
+    """Write the versions of a node's Python into its folder: a container has its own Python."""
+    with contextlib.suppress(OSError):  # a full disk is reported by what loses more by it
         (node_folder / _VERSIONS).write_text(json.dumps(python_versions(), indent=2), "utf-8")
 
 
 def _noted_versions(node_folder: Path) -> Any:
     try:
         return json.loads(read_bytes(node_folder / _VERSIONS))
-    except (OSError, ValueError, RecursionError):  # it never began, or the disk was full
+    except (OSError, ValueError, RecursionError):  # the node never began, or the disk was full
         return None
 
 
 def installed_packages(folders: Iterable[str]) -> dict[str, str]:
-    """Name and version of every package on a search path, read from the names of its metadata.
-
-    (``importlib.metadata`` would open each of some 200 files: 0.2 s.)
-    """
+    """Name and version of every package on a search path."""
+    # From names of folders: importlib.metadata would open each of some 200 files (0.2 s).
     found: dict[str, str] = {}
     for folder in folders:
         with contextlib.suppress(OSError):
@@ -86,7 +84,7 @@ def installed_packages(folders: Iterable[str]) -> dict[str, str]:
 
 
 def machine() -> dict[str, Any]:
-    """The machine, as far as figures depend on it."""
+    """Name, processor, cores, memory in bytes and system of this machine."""
     return {
         "name": platform.node(),
         "processor": _first("/proc/cpuinfo", "model name") or platform.machine(),
@@ -98,7 +96,7 @@ def machine() -> dict[str, Any]:
 
 
 def seeds(nodes: Iterable[Node]) -> dict[str, dict[str, str]]:
-    """By node, the variables of its environment that are named after a seed."""
+    """By node, the variables of its environment with SEED in their names."""
     found = {
         node.name: {key: value for key, value in node.environment.items() if "SEED" in key.upper()}
         for node in nodes
@@ -107,10 +105,7 @@ def seeds(nodes: Iterable[Node]) -> dict[str, dict[str, str]]:
 
 
 class GitState:
-    """Commit of a folder, asked for in the background, so that the start does not wait for git.
-
-    Reads the state from when it is made.
-    """
+    """Commit of a folder; git runs in the background, so that the start does not wait for it."""
 
     def __init__(self, folder: Path) -> None:
         self._state: dict[str, Any] | None = None

@@ -1,6 +1,6 @@
-"""Bag of a run: moves packets from the spools into it, ordered by wall time, and repairs it.
+"""Recorder: moves packets from the spools of a run into its bag, ordered by wall time.
 
-A run that was cut off is repaired from the file of its bag and from the spools.
+The bag of a run that was cut off is repaired from its file and from the spools.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from neuros.recording.run_file import read_run_file
 from neuros.recording.spool import (
     NO_TIME,
     ForwardClock,
-    Record,
     SpoolReader,
+    SpoolRecord,
     forget_listened,
     listened_topics,
 )
-from neuros.recording.stored import Stored, contents_of, faults_of, is_whole, stored_messages
+from neuros.recording.stored import contents_of, faults_of, is_whole, stored_messages
 
-# A packet is in its spool this long after its time at the latest, unless its process was kept from
-# running. Readers of bags sort, so a packet that comes later is only less convenient.
-_SETTLED_NS = 20_000_000
+# A packet is in its spool this long after its time, unless its process was kept from running.
+# Readers of bags sort, so a packet that comes later does no harm.
+_SPOOLING_NS = 20_000_000
 _MOST_BYTES = 8 << 20
 _ALL_NS = (1 << 63) - 1
 
@@ -57,9 +57,9 @@ class Recorder:
 
     Args:
         run: the run folder.
-        complain: is told of each problem, in a sentence.
-        is_new: asked with the number of a topic and a wall time whether the bag lacks that packet.
-        clock: monotonic, in seconds: when a flush is due.
+        complain: receives each problem, a sentence.
+        is_new: whether the bag lacks the packet of a topic, by its number, at a wall time.
+        clock: monotonic, in seconds; tells when a flush is due.
 
     Raises:
         OSError: if the bag cannot be made.
@@ -112,13 +112,13 @@ class Recorder:
         return self.topics[topic]
 
     def poll(self) -> bool:
-        """Move what there is; returns whether there is more right now. Raises ``OSError``."""
-        has_more = self._move(self._wall_clock() - _SETTLED_NS)
+        """Move packets; returns whether the spools have more now. Raises ``OSError``."""
+        has_more = self._move(self._wall_clock() - _SPOOLING_NS)
         if not self._is_flushed and self._clock() >= self._due_s:
             self._due_s = self._clock() + self._plan.flush_interval
             self.bag.flush()
             self._is_flushed = True
-            # Whatever was read and is not held is in the bag.
+            # All that was read is in the bag, but for what is held.
             safe_ns = self._held[0][0] - 1 if self._held else _ALL_NS
             for source in self._sources:
                 if not source.is_damaged:
@@ -129,14 +129,6 @@ class Recorder:
     def is_fed(self) -> bool:
         """Whether a process still has a spool open for writing."""
         return any(source.reader.is_fed for source in self._sources)
-
-    def copy(self, topic: Topic, message: Stored) -> int | None:
-        """Put a message of another bag into this one; returns the number of its topic, as
-        :meth:`number_of`. Raises ``OSError``."""
-        number = self.number_of(topic)
-        if number is not None:
-            self.bag.put(number, message.log_ns, message.publish_ns, message.data)
-        return number
 
     def complete(self) -> None:
         """Move all that is left, and close the bag. Raises ``OSError``."""
@@ -168,7 +160,7 @@ class Recorder:
     # ------------------------------------------------------------------ inside
 
     def _move(self, horizon_ns: int | None) -> bool:
-        """Write what is not later than ``horizon_ns``; returns whether a spool has more."""
+        """Write packets up to ``horizon_ns`` (``None``: all); returns whether a spool has more."""
         has_more = False
         for source in self._sources:
             records, is_capped = self._read(source)
@@ -192,8 +184,8 @@ class Recorder:
         self._is_flushed = self._is_flushed and not written
         return has_more
 
-    def _read(self, source: _SpoolSource) -> tuple[list[Record], bool]:
-        """As the reader of the source; nothing more once it has failed."""
+    def _read(self, source: _SpoolSource) -> tuple[list[SpoolRecord], bool]:
+        """Records of a spool, and whether it has more; none once it has failed."""
         if source.has_failed:
             return [], False
         try:
@@ -211,8 +203,8 @@ class Recorder:
             )
             return [], False
 
-    def _topics_of(self, record: Record, source: _SpoolSource) -> tuple[int, ...] | None:
-        """The numbers of its topics; ``None`` if no node of NeuROS can have written it."""
+    def _topics_of(self, record: SpoolRecord, source: _SpoolSource) -> tuple[int, ...] | None:
+        """The numbers of its topics; ``None`` if the record is damaged."""
         if record.stream < len(source.topics) and record.wall_ns >= 0 and record.sim_ns >= NO_TIME:
             return source.topics[record.stream]
         self._complain_of(source)
@@ -249,8 +241,8 @@ class _SpoolSource:
     """A spool, and the numbers of the topics of each of its streams.
 
     Attributes:
-        is_damaged: whether something in it was not recorded, so that it has to stay.
-        has_failed: whether it can be read no more.
+        is_damaged: whether a part was not recorded; the spool is kept then.
+        has_failed: whether reading it has failed.
     """
 
     reader: SpoolReader
@@ -262,7 +254,7 @@ class _SpoolSource:
 
 @contextlib.contextmanager
 def the_only_recorder(run: Path) -> Iterator[bool]:
-    """Whether no other process writes the bag of a run, now and within the block."""
+    """Lock the bag of a run within the block; yields whether no other process writes it."""
     with open_ordinary(run / PLAN_NAME) as plan:
         try:
             fcntl.flock(plan, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -279,17 +271,17 @@ def needs_repair(run: Path, plan: RecordingPlan) -> bool:
     try:
         return any(SpoolReader(run / name).has_files for name in (*plan.streams, LISTENER))
     except OSError:
-        return True  # a repair tells what is wrong
+        return True  # the repair tells the reason
 
 
 @dataclass(frozen=True)
 class Repaired:
-    """What came of a repair.
+    """Result of a repair.
 
     Attributes:
         counts: by topic, the packets in the bag.
-        changed: how many packets may have changed, since the checksum of their part was wrong.
-        lost: by topic, how many packets were in the bag when the run ended, and are not now.
+        changed: how many packets are in parts with a wrong checksum.
+        lost: by topic, how many packets the bag has lost since the run ended.
     """
 
     counts: dict[str, int]
@@ -303,17 +295,19 @@ def repair(
     """Complete the bag of a run; ``None`` if it is complete.
 
     Args:
-        complain: told in one sentence of each part that is damaged.
-        keeps_changed: keep packets that may have changed; else they are left out.
+        complain: receives a sentence for each damaged part.
+        keeps_changed: whether to keep packets in parts with a wrong checksum.
 
     Raises:
-        UsageError: if the run was not recorded, or by another version.
+        UsageError: if the run was not recorded, or was recorded by another version.
         EnvironmentFault: if it is still being recorded, or cannot be written.
     """
     plan = load_plan(run)
     try:
         with the_only_recorder(run) as is_alone:
-            if not is_alone or _is_fed(run, plan):
+            # A node may go on though its recorder does not.
+            spools = (SpoolReader(run / name) for name in (*plan.streams, LISTENER))
+            if not is_alone or any(spool.is_fed for spool in spools):
                 raise EnvironmentFault(f"{run} is still being recorded: wait for its end")
             if not needs_repair(run, plan) and not faults_of(run / BAG_NAME, counts_of(run)):
                 return None
@@ -326,8 +320,10 @@ def repair(
 
 
 def recorded_counts(run: Path) -> dict[str, int]:
-    """By topic, the packets that were in the bag when the run ended, or when it was last written,
-    as far as is known."""
+    """By topic, the packets that the bag had when the run ended, or when it was last written.
+
+    Empty if neither ``run.json`` nor the metadata of the bag tell.
+    """
     with contextlib.suppress(UsageError, EnvironmentFault, KeyError):
         topics = read_run_file(run)["recording"]["topics"]
         return {name: int(topic["recorded"]) for name, topic in topics.items()}
@@ -339,7 +335,7 @@ def recorded_counts(run: Path) -> dict[str, int]:
 
 
 def lost_of(recorded: Mapping[str, int], there: Mapping[str, int]) -> dict[str, int]:
-    """By topic, how many packets fewer there are than were recorded."""
+    """By topic, how many of the recorded packets are not there."""
     lost = {name: count - there.get(name, 0) for name, count in recorded.items()}
     return {name: count for name, count in lost.items() if count > 0}
 
@@ -357,11 +353,6 @@ def counts_of(run: Path) -> dict[str, int]:
         raise OSError(errno.EIO, str(error)) from error
 
 
-def _is_fed(run: Path, plan: RecordingPlan) -> bool:
-    """Whether a node of the run goes on, though its recorder does not."""
-    return any(SpoolReader(run / name).is_fed for name in (*plan.streams, LISTENER))
-
-
 def _rebuild(
     run: Path, plan: RecordingPlan, complain: Callable[[str], object], *, keeps_changed: bool
 ) -> Repaired:
@@ -374,26 +365,27 @@ def _rebuild(
     if not damaged.exists():
         if bag.exists():
             bag.rename(damaged)
-    elif bag.exists():  # a repair that did not come to its end
+    elif bag.exists():  # left by a repair that was interrupted
         shutil.rmtree(bag)
     present: set[tuple[int, int]] = set()
     faults: list[str] = []
     changed = 0
 
-    def note(fault: str) -> None:
+    def add_fault(fault: str) -> None:
         faults.append(fault)
         complain(fault)
 
     recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
     try:
-        for message in stored_messages(damaged, note) if damaged.exists() else ():
+        for message in stored_messages(damaged, add_fault) if damaged.exists() else ():
             if message.may_have_changed:
                 changed += 1
                 if not keeps_changed:
                     continue
             topic = topics.get(message.topic)
-            number = None if topic is None else recorder.copy(topic, message)
+            number = None if topic is None else recorder.number_of(topic)
             if number is not None:
+                recorder.bag.put(number, message.log_ns, message.publish_ns, message.data)
                 present.add((number, message.log_ns))
         recorder.complete()
     except BaseException:
@@ -404,7 +396,7 @@ def _rebuild(
         raise
     counts = recorder.counts()
     lost = lost_of(recorded, counts)
-    # In this order: cut off in between, the next repair finds all that is not in the bag.
+    # The spools go last: if this is interrupted, the next repair finds all packets.
     if damaged.exists():
         kept = run / KEPT_NAME
         if (faults or lost) and not kept.exists():

@@ -17,8 +17,8 @@ from typing import NamedTuple
 from neuros.control.link import read_as
 from neuros.errors import ControlError, EnvironmentFault, UsageError
 from neuros.ports import Way
-from neuros.project.model import Connection, Node, Project
-from neuros.project.names import INTERNAL, Names
+from neuros.project.model import Project
+from neuros.project.names import INTERNAL
 from neuros.project.qos import ASKED, DEPTH, OFFERED
 from neuros.recording.run_file import read_object
 
@@ -26,10 +26,10 @@ CLOCK = "/clock"
 PLAN_NAME = "recording.json"
 BAG_NAME = "bag"
 LISTENER = ".listener"
-"""Folder of the packets that no node sees; it is named like none can be."""
+"""Folder of packets that no node sees; no node can have its name."""
 
 _VERSION = 1
-_NODE_NAME = re.compile(r"_?[A-Za-z][A-Za-z0-9_]{,250}")  # it has a folder
+_NODE_NAME = re.compile(r"_?[A-Za-z][A-Za-z0-9_]{,250}")  # a folder has this name
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,14 @@ class Topic:
 
 
 @dataclass(frozen=True)
-class Stream:
-    """Packets that one node keeps: how they pass it (``neuros.ports.Way``), and the topics that
-    they belong to, by their places in the plan."""
+class RecordedStream:
+    """Packets that one node keeps.
+
+    Attributes:
+        way: how they pass the node (:class:`neuros.ports.Way`).
+        name: of the port or connection.
+        topics: places in the plan of the topics that carry them.
+    """
 
     way: str
     name: str
@@ -66,16 +71,16 @@ class RecordingPlan:
     """All that is recorded of a run.
 
     Attributes:
-        streams: by node, in the order of the numbers that they have in its spool.
+        streams: by node, in the order of their numbers in its spool.
         listen: topics that the recorder subscribes to itself.
-        wanted: those of them that were asked for by name.
+        wanted: those of ``listen`` that the user has named.
         time_owner: the one node that owns simulated time; ``None`` if none or several do.
         custom: for the metadata of the bag.
         flush_interval: seconds after which packets are on the disk.
     """
 
     topics: tuple[Topic, ...]
-    streams: Mapping[str, tuple[Stream, ...]]
+    streams: Mapping[str, tuple[RecordedStream, ...]]
     listen: tuple[str, ...] = ()
     wanted: tuple[str, ...] = ()
     time_owner: str | None = None
@@ -83,7 +88,7 @@ class RecordingPlan:
     flush_interval: float = 1.0
 
     def save(self, run: Path) -> None:
-        """Write it into the run folder. Raises ``OSError``."""
+        """Write the plan into the run folder. Raises ``OSError``."""
         content = {"version": _VERSION, **asdict(self)}
         (run / PLAN_NAME).write_text(json.dumps(content, indent=2) + "\n", "utf-8")
 
@@ -103,7 +108,7 @@ def load_plan(run: Path) -> RecordingPlan:
             raise UsageError(
                 f"{path} is of version {version}, and this NeuROS reads version {_VERSION}"
             )
-        content.pop("storage", None)  # of plans when there was a choice
+        content.pop("storage", None)  # earlier versions had a choice of storages
         plan = read_as(RecordingPlan, content)
         places = {place for each in plan.streams.values() for s in each for place in s.topics}
         if not places <= {*range(len(plan.topics))} or not all(
@@ -118,7 +123,7 @@ def load_plan(run: Path) -> RecordingPlan:
 
 
 def _why_no_plan(run: Path) -> str:
-    """Say why a path is no folder of a recorded run."""
+    """Why a path is not the folder of a recorded run."""
     if not run.exists():
         return f"{run}: there is no such file or folder"
     if not run.is_dir():
@@ -132,13 +137,13 @@ def _why_no_plan(run: Path) -> str:
 
 
 @dataclass(frozen=True)
-class Request:
+class RecordingRequest:
     """Topics to record.
 
     Attributes:
-        everything: all that the project's nodes send and hear, and ``/clock``.
-        topics: names and patterns of topics, connections or outputs; besides everything, or alone.
-        exclude: names and patterns that are left out in any case.
+        everything: all topics that nodes of the project send or receive, and ``/clock``.
+        topics: names and patterns of topics, connections or outputs to record as well, or alone.
+        exclude: names and patterns of what is left out in any case.
         flush_interval: seconds after which packets are on the disk.
     """
 
@@ -149,7 +154,7 @@ class Request:
 
 
 class _Candidate(NamedTuple):
-    """Candidate to keep the packets of a topic: a node, and the way in which they pass it."""
+    """A node that can keep the packets of a topic, and the way in which they pass the node."""
 
     node: str
     way: Way
@@ -160,7 +165,7 @@ class _Candidate(NamedTuple):
 def plan_recording(
     project: Project,
     names: Collection[str],
-    request: Request,
+    request: RecordingRequest,
     *,
     is_alone: bool,
     custom: Mapping[str, str],
@@ -168,14 +173,23 @@ def plan_recording(
     """Plan the recording of a run of the nodes ``names``.
 
     Args:
-        is_alone: only the run can publish in its domain, so there is no clock to hear.
+        is_alone: no other program can publish in the domain, so ``/clock`` is not recorded.
 
     Raises:
-        UsageError: if something is asked for that does not exist.
+        UsageError: for a topic that does not exist.
     """
-    _check_excluded(request, project)
+    everywhere = _candidates(project, [node.name for node in project.nodes])
+    labels = [(each.topic.name, each.topic.connection) for each in everywhere]
+    for text in request.exclude:
+        if not _may_be_on_graph(text, project) and not any(is_named(*x, [text]) for x in labels):
+            raise _unknown("--exclude", text, project)
     candidates = list(_candidates(project, names))
-    chosen = [each for each in candidates if _is_chosen(each.topic, request)]
+    chosen = [
+        each
+        for each in candidates
+        if not is_named(each.topic.name, each.topic.connection, request.exclude)
+        and (request.everything or is_named(each.topic.name, each.topic.connection, request.topics))
+    ]
     known = {each.topic.name for each in candidates}
     wanted = _asked_of_ros(request, known, project)
     listen = list(wanted)
@@ -200,41 +214,33 @@ def plan_recording(
 def _candidates(project: Project, names: Collection[str]) -> Iterator[_Candidate]:
     """One for each topic and sender, in the order of the project."""
     for connection in project.connections:
-        yield from _of_connection(project, connection, names)
+        source, destination = connection.source_node, connection.destination_node
+        topic = Topic(
+            f"{connection.topic}/data",
+            project.node(source).output(connection.source_output).type,
+            connection.is_reliable,
+            connection.window,
+            str(connection),
+        )
+        if source in names and source == destination:
+            yield _Candidate(source, Way.TO_ITSELF, str(connection), topic)
+        elif source in names:
+            yield _Candidate(source, Way.SENT, connection.source_output, topic)
+        elif destination in names:
+            yield _Candidate(destination, Way.RECEIVED, str(connection), topic)
     nodes = [node for node in project.nodes if node.name in names]
     seen: set[str] = set()
     for is_output, node in itertools.product((True, False), nodes):
-        for candidate in _of_external_topics(project.names, node, is_output=is_output):
-            if is_output or candidate.topic.name not in seen:
-                seen.add(candidate.topic.name)
-                yield candidate
-
-
-def _of_connection(
-    project: Project, connection: Connection, names: Collection[str]
-) -> Iterator[_Candidate]:
-    source, destination = connection.source_node, connection.destination_node
-    topic = Topic(
-        f"{connection.topic}/data",
-        project.node(source).output(connection.source_output).type,
-        connection.is_reliable,
-        connection.window,
-        str(connection),
-    )
-    if source in names and source == destination:
-        yield _Candidate(source, Way.TO_ITSELF, str(connection), topic)
-    elif source in names:
-        yield _Candidate(source, Way.SENT, connection.source_output, topic)
-    elif destination in names:
-        yield _Candidate(destination, Way.RECEIVED, str(connection), topic)
-
-
-def _of_external_topics(names: Names, node: Node, *, is_output: bool) -> Iterator[_Candidate]:
-    for port in node.outputs if is_output else node.inputs:
-        if port.external_topic is not None:
+        for port in node.outputs if is_output else node.inputs:
+            if port.external_topic is None:
+                continue
+            name = project.names.resolve(port.external_topic, node.name)
+            if name in seen and not is_output:
+                continue  # a node that sends the topic, or receives it, keeps it already
+            seen.add(name)
             qos = port.qos or (OFFERED if is_output else ASKED)
             topic = Topic(
-                names.resolve(port.external_topic, node.name),
+                name,
                 port.type,
                 qos.reliability != "best_effort" if is_output else qos.reliability == "reliable",
                 qos.depth or DEPTH,
@@ -245,37 +251,33 @@ def _of_external_topics(names: Names, node: Node, *, is_output: bool) -> Iterato
 
 def _streams(
     chosen: Sequence[_Candidate], topics: Sequence[Topic]
-) -> dict[str, tuple[Stream, ...]]:
-    """Packets that pass a node in one way are kept once, for all their topics."""
+) -> dict[str, tuple[RecordedStream, ...]]:
+    """By node, its streams: packets that pass a node in one way are kept once for all topics."""
     groups: dict[tuple[str, Way, str], list[int]] = {}
     for node, way, name, topic in chosen:
         groups.setdefault((node, way, name), []).append(topics.index(topic))
-    streams: dict[str, tuple[Stream, ...]] = {}
+    streams: dict[str, tuple[RecordedStream, ...]] = {}
     for (node, way, name), members in groups.items():
-        stream = Stream(way.value, name, tuple(members))
+        stream = RecordedStream(way.value, name, tuple(members))
         streams[node] = (*streams.get(node, ()), stream)
     return streams
 
 
-def _is_chosen(topic: Topic, request: Request) -> bool:
-    if is_named(topic.name, topic.connection, request.exclude):
-        return False
-    return request.everything or is_named(topic.name, topic.connection, request.topics)
-
-
 def is_named(name: str, connection: str | None, patterns: Sequence[str]) -> bool:
-    """Whether one of the patterns fits a topic, its connection, or the output that feeds it."""
+    """Whether a pattern fits a topic, its connection, or the output that sends on it."""
     words = [name, name.removesuffix("/data")] if connection else [name]
     if connection:
         words += [connection, connection.partition(" -> ")[0]]
     return any(fnmatchcase(word, pattern) for word in words for pattern in patterns)
 
 
-def _asked_of_ros(request: Request, known: Collection[str], project: Project) -> tuple[str, ...]:
-    """Topics that only the ROS graph can know.
+def _asked_of_ros(
+    request: RecordingRequest, known: Collection[str], project: Project
+) -> tuple[str, ...]:
+    """Topics of the request that only the ROS graph can know.
 
     Raises:
-        UsageError: for what can be neither on the graph nor in the project.
+        UsageError: for a topic that can be neither on the graph nor in the project.
     """
     labels = {str(connection): f"{connection.topic}/data" for connection in project.connections}
     found: dict[str, None] = {}
@@ -291,18 +293,8 @@ def _asked_of_ros(request: Request, known: Collection[str], project: Project) ->
     return tuple(found)
 
 
-def _check_excluded(request: Request, project: Project) -> None:
-    """Raise ``UsageError`` for what leaves nothing out, nor could on the ROS graph."""
-    topics = [each.topic for each in _candidates(project, [node.name for node in project.nodes])]
-    for text in request.exclude:
-        if not _may_be_on_graph(text, project) and not any(
-            is_named(topic.name, topic.connection, [text]) for topic in topics
-        ):
-            raise _unknown("--exclude", text, project)
-
-
 def _may_be_on_graph(text: str, project: Project) -> bool:
-    """Whether other programs may have a topic of that name."""
+    """Whether another program may have a topic of that name."""
     return text.startswith("/") and not text.startswith(project.names.namespace + INTERNAL)
 
 

@@ -20,15 +20,15 @@ FORMAT = 2
 
 
 def write_run_file(record: Mapping[str, Any], folder: Path) -> None:
-    """Write it, the whole of it or nothing. Raises ``OSError``."""
+    """Write the whole record, or nothing. Raises ``OSError``."""
     write_whole(folder / RUN_FILE, f"{json.dumps(record, indent=2)}\n".encode())
 
 
 def read_run_file(folder: Path) -> dict[str, Any]:
-    """The record of the run that has left this folder behind.
+    """Read the record in a run folder.
 
     Raises:
-        UsageError: if there is none, or another version of NeuROS wrote it.
+        UsageError: if there is no record, or another version of NeuROS wrote it.
         EnvironmentFault: if it is damaged.
     """
     file = folder / RUN_FILE
@@ -51,17 +51,17 @@ def read_run_file(folder: Path) -> dict[str, Any]:
 
 
 def check_record(record: Mapping[str, Any], file: Path) -> None:
-    """Raise ``EnvironmentFault`` for a record, of a file, that does not describe a run."""
+    """Raise ``EnvironmentFault`` for a record that breaks the schema of ``run.json``."""
     if wrong := mistake(record, "run"):
         raise EnvironmentFault(f"{file} is broken: {wrong}")
 
 
 def read_node_file(folder: Path) -> NodeFile:
-    """What the node was told that has this folder in that of its run.
+    """Read ``node.json`` in the folder of a node.
 
     Raises:
         FileNotFoundError, NotADirectoryError: if there is no such file.
-        EnvironmentFault: if it cannot be read, or holds anything else.
+        EnvironmentFault: if it cannot be read, or is damaged.
     """
     file = folder / "node.json"
     content = read_object(file)
@@ -77,11 +77,11 @@ def read_node_file(folder: Path) -> NodeFile:
 
 
 def read_object(file: Path) -> dict[str, Any]:
-    """The JSON object in a file of a run folder.
+    """Read the JSON object in a file of a run folder.
 
     Raises:
         FileNotFoundError, NotADirectoryError: if there is no such file.
-        EnvironmentFault: if it cannot be read, or holds anything else.
+        EnvironmentFault: if it cannot be read, or holds something else.
     """
     try:
         found = json.loads(read_bytes(file))

@@ -1,11 +1,11 @@
 """Spool: the packets that one node keeps, on their way into the bag.
 
-Files, each appended to until it has some size: the recorder reads behind the writer and removes a
-file once all of it is safe in the bag. A packet is one ``write`` to the page cache: it costs 2 us,
-or 0.2 ms for a megabyte, and it outlives its process, however that ends.
+A spool is a folder of files. A node appends to the newest one until it has some size; the recorder
+reads behind the node, and removes a file once all of it is safe in the bag. A packet is one
+``write`` to the page cache: it costs 2 us, or 0.2 ms for a megabyte, and survives its process.
 
-Each record is a header (length of the packet, number of its stream, wall time and simulated time in
-nanoseconds, -1: none) and the packet.
+A record is a header and the packet. The header has the length of the packet, the number of its
+stream, its wall time and its simulated time, both in nanoseconds (-1: none).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from neuros.errors import ControlError
 from neuros.ordinary_files import descriptor_of, folder_in, write_whole
 from neuros.ports import Way
 from neuros.project.scanner import read_bytes
-from neuros.recording.recording_plan import LISTENER, RecordingPlan, Stream, Topic
+from neuros.recording.recording_plan import LISTENER, RecordedStream, RecordingPlan, Topic
 
 FILE_BYTES = 8 << 20
 MOST_BYTES = 1 << 27
-"""Of a packet: a file that a node has written may claim any size, and cost it no disk."""
+"""The largest packet. A sparse file of a node could claim any size."""
 NO_TIME = -1
 
 _FOLDER = "spool"
@@ -42,8 +42,8 @@ _HEADER = struct.Struct("<IIqq")
 _SMALL_BYTES = 4096  # up to here a copy costs less than a write in two parts
 
 
-class Record(NamedTuple):
-    """A packet that a node has kept; times in nanoseconds."""
+class SpoolRecord(NamedTuple):
+    """A packet in a spool; times in nanoseconds."""
 
     wall_ns: int
     sim_ns: int
@@ -52,7 +52,7 @@ class Record(NamedTuple):
 
 
 class ForwardClock:
-    """Wall time in nanoseconds that goes on evenly where the clock is set back."""
+    """Wall time in nanoseconds that goes on evenly when the clock is set back."""
 
     def __init__(self) -> None:
         self._ahead_ns = time.time_ns() - time.monotonic_ns()
@@ -68,14 +68,14 @@ class SpoolWriter:
     """Keeps the packets of one node (:class:`neuros.ports.PacketRecorder`).
 
     Args:
-        folder: the node's own in the run folder.
-        streams: what is kept; records name a stream by its place in here.
+        folder: of the node, in the run folder.
+        streams: packets to keep; a record names its stream by the place in this list.
     """
 
     def __init__(
         self,
         folder: Path,
-        streams: Sequence[Stream],
+        streams: Sequence[RecordedStream],
         *,
         file_bytes: int = FILE_BYTES,
         clock: Callable[[], int] | None = None,
@@ -92,19 +92,19 @@ class SpoolWriter:
         self._last_ns = 0
 
     def stream(self, way: Way, name: str) -> int | None:
-        """The number of such packets; ``None``: they are not kept."""
+        """The number of a stream; ``None`` if its packets are not kept."""
         return self._numbers.get((way, name))
 
     def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
-        """Keep a packet. Raises ``OSError``, and is not to be called again then."""
+        """Keep a packet. Raises ``OSError``; then it must not be called again."""
         now_ns = self._clock()
-        # No two packets of a spool have the same time, so that a packet can be told by it.
+        # The time identifies a packet of the spool: no two packets have the same.
         self._last_ns = now_ns = now_ns if now_ns > self._last_ns else self._last_ns + 1
         sim_ns = NO_TIME if sim_time_s is None else max(0, round(sim_time_s * 1e9))
         self.append(now_ns, sim_ns, stream, data)
 
     def append(self, wall_ns: int, sim_ns: int, stream: int, data: bytes) -> None:
-        """Write what will be read as a :class:`Record`. Raises ``OSError``."""
+        """Write a :class:`SpoolRecord`. Raises ``OSError``."""
         if len(data) > MOST_BYTES:
             why = f"a packet of {len(data)} bytes; {MOST_BYTES} are the most that can be recorded"
             raise OSError(errno.EFBIG, why)
@@ -120,7 +120,7 @@ class SpoolWriter:
         self._size += written
 
     def close(self) -> None:
-        """Keep nothing any more."""
+        """Close the file."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
@@ -130,7 +130,7 @@ class SpoolWriter:
         flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_APPEND
         with folder_in(self._folder.parent, self._folder.name, _FOLDER, makes=True) as folder:
             self._descriptor = os.open(_path(folder, self._files), flags, 0o644)
-        fcntl.flock(self._descriptor, fcntl.LOCK_SH)  # until the writer closes it or ends
+        fcntl.flock(self._descriptor, fcntl.LOCK_SH)  # until it is closed
         self._files += 1
         self._size = 0
 
@@ -152,26 +152,33 @@ class SpoolReader:
         self._last_ns = 0
         self._done: list[tuple[int, int]] = []
 
-    def read(self, most_bytes: int) -> tuple[list[Record], bool]:
+    def read(self, most_bytes: int) -> tuple[list[SpoolRecord], bool]:
         """The next complete records, and whether there is more now."""
-        records: list[Record] = []
+        records: list[SpoolRecord] = []
         left = most_bytes
         while left > 0 and not self.is_damaged:
-            if self._descriptor < 0 and not self._open_next():
-                return records, False
-            if self._is_there:  # a record that is larger than what is asked for comes whole
+            if self._descriptor < 0:
+                numbers = [n for n in self._numbers() if self._file is None or n > self._file]
+                if not numbers:
+                    return records, False
+                self._descriptor = self._open(numbers[0])
+                self._file = numbers[0]
+                self._rest, self._missing = b"", 0
+            if self._has_more:  # a record that is larger than ``most_bytes`` comes whole
                 data = os.read(self._descriptor, max(left, self._missing))
                 left -= len(data)
                 self._rest = _split(self._rest + data if self._rest else data, records)
                 self._missing = _missing(self._rest)
                 self._last_ns = records[-1].wall_ns if records else self._last_ns
-            elif not self._leave_file():
+            elif not _path(self._folder / _FOLDER, (self._file or 0) + 1).exists():
                 return records, False
+            elif not self._has_more:  # the file may have grown just before the next one was begun
+                self._close_file()
         return records, not self.is_damaged
 
     @property
     def is_damaged(self) -> bool:
-        """Whether a record claims more than a packet may have; nothing behind it is read."""
+        """Whether a record claims to be larger than any packet; the reader stops there."""
         return self._missing > MOST_BYTES
 
     def __str__(self) -> str:
@@ -179,12 +186,12 @@ class SpoolReader:
 
     @property
     def has_files(self) -> bool:
-        """Whether there is something to read. Raises ``OSError``."""
+        """Whether the spool has files. Raises ``OSError``."""
         return bool(self._numbers())
 
     @property
     def is_fed(self) -> bool:
-        """Whether its writer has a file open now."""
+        """Whether a writer has the newest file open."""
         try:
             numbers = self._numbers()
             if not numbers:
@@ -201,18 +208,16 @@ class SpoolReader:
         return False
 
     def remove_up_to(self, wall_ns: int) -> None:
-        """Remove the files that were read to their end and have nothing later than that."""
+        """Remove the files that were read to their end, if all packets are up to ``wall_ns``."""
         while self._done and self._done[0][1] <= wall_ns:
             with contextlib.suppress(OSError), self._spool() as spool:
                 _path(spool, self._done[0][0]).unlink()
             del self._done[0]
 
     def close(self, *, remove: bool) -> None:
-        """Stop reading; ``remove``: and remove all that was read."""
+        """Stop reading; ``remove``: also remove the files."""
         if self._descriptor >= 0:
-            os.close(self._descriptor)
-            self._descriptor = -1
-            self._done.append((self._file or 0, self._last_ns))
+            self._close_file()
         if remove:
             self.remove_up_to(self._last_ns)
             with (
@@ -233,41 +238,24 @@ class SpoolReader:
             return sorted(int(name) for name in os.listdir(spool) if _NAME.fullmatch(name))
         return []
 
-    def _open_next(self) -> bool:
-        numbers = [n for n in self._numbers() if self._file is None or n > self._file]
-        if not numbers:
-            return False
-        self._descriptor = self._open(numbers[0])
-        self._file = numbers[0]
-        self._rest, self._missing = b"", 0
-        return True
-
     @property
-    def _is_there(self) -> bool:
-        """Whether the file has the rest of the record that has begun, or anything behind it."""
+    def _has_more(self) -> bool:
+        """Whether the file has the rest of the record that has begun, or else any more bytes."""
         position = os.lseek(self._descriptor, 0, os.SEEK_CUR)
         return os.fstat(self._descriptor).st_size - position >= max(1, self._missing)
 
-    def _leave_file(self) -> bool:
-        """Whether the writer has gone on to another file, so that this one will not grow."""
-        assert self._file is not None
-        if not _path(self._folder / _FOLDER, self._file + 1).exists():
-            return False
-        # It may have grown between the look at its end and the look for the next.
-        if self._is_there:
-            return True
+    def _close_file(self) -> None:
         os.close(self._descriptor)
         self._descriptor = -1
-        self._done.append((self._file, self._last_ns))
-        return True
+        self._done.append((self._file or 0, self._last_ns))
 
 
 def _path(spool: Path, number: int) -> Path:
     return spool / f"{number:08d}"
 
 
-def _split(data: bytes, records: list[Record]) -> bytes:
-    """Take the complete records off the front; returns the rest."""
+def _split(data: bytes, records: list[SpoolRecord]) -> bytes:
+    """Append the complete records in front to ``records``; returns the rest of the data."""
     at, end, head = 0, len(data), _HEADER.size
     unpack = _HEADER.unpack_from
     while at + head <= end:
@@ -275,13 +263,13 @@ def _split(data: bytes, records: list[Record]) -> bytes:
         after = at + head + length
         if after > end:
             break
-        records.append(Record(wall_ns, sim_ns, stream, data[at + head : after]))
+        records.append(SpoolRecord(wall_ns, sim_ns, stream, data[at + head : after]))
         at = after
     return data[at:]
 
 
 def _missing(rest: bytes) -> int:
-    """So many bytes more complete a record, or its header, that has begun."""
+    """How many bytes complete the record, or the header, that has begun."""
     if not rest:
         return 0
     whole = _HEADER.size
@@ -294,10 +282,9 @@ _LIST = "topics.json"
 
 
 class ListenedSpool:
-    """Spool of the recorder itself, for topics that become known as the run goes on.
+    """Spool of the recorder, for topics that are known only when a sender appears.
 
-    Their types and qualities of service are known only when a sender appears; so the list of topics
-    is written before the first packet of each, for all readers of the spool.
+    The list of topics is written before the first packet of each, for all readers of the spool.
     """
 
     def __init__(self, run: Path) -> None:
@@ -318,12 +305,12 @@ class ListenedSpool:
         self._spool.append(wall_ns, NO_TIME, number, data)
 
     def close(self) -> None:
-        """Keep nothing any more."""
+        """Close the spool."""
         self._spool.close()
 
 
 def listened_topics(run: Path) -> list[Topic]:
-    """The topics that have been heard so far, in the order of their numbers.
+    """The topics that the recorder has received so far, in the order of their numbers.
 
     Raises:
         OSError: if the list cannot be read.
@@ -331,7 +318,7 @@ def listened_topics(run: Path) -> list[Topic]:
     path = run / LISTENER / _LIST
     try:
         content = json.loads(read_bytes(path))
-        json.dumps(content, ensure_ascii=False).encode()  # as it will be in the bag
+        json.dumps(content, ensure_ascii=False).encode()  # the bag must be able to hold it
         return [read_as(Topic, each) for each in content]
     except FileNotFoundError:
         return []
@@ -345,7 +332,7 @@ def listened_topics(run: Path) -> list[Topic]:
 
 
 def forget_listened(run: Path) -> None:
-    """Remove the list, if it can be; its spool must have been removed before."""
+    """Remove the list of topics, if possible; its spool must have been removed before."""
     with contextlib.suppress(OSError):
         with folder_in(run, LISTENER) as folder:
             for name in (_LIST, f".{_LIST}"):

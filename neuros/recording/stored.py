@@ -1,8 +1,8 @@
-"""Packets that are stored in the files of a bag, read as far as they go, and checked.
+"""Reader of bags, also of damaged ones.
 
-MCAP files are read by the ``mcap`` library, since ``rosbags`` gives a message one time and needs an
-index, which the file of a run that was killed lacks. All else that ``rosbags`` knows is read by it.
-Checksums of chunks and of the summary tell what is not as it was written.
+The ``mcap`` library reads MCAP files, since ``rosbags`` gives a message only one time, and needs an
+index, which the file of a killed run lacks. ``rosbags`` reads all other formats. Checksums of
+chunks and of the summary reveal damage.
 """
 
 from __future__ import annotations
@@ -49,7 +49,8 @@ _BY_MESSAGE = re.compile(rb"compression_mode\W+message\b", re.IGNORECASE)
 class Stored(NamedTuple):
     """A message of a bag; times in nanoseconds.
 
-    ``may_have_changed``: the checksum of its part of the file is wrong.
+    Attributes:
+        may_have_changed: whether the checksum of its part of the file is wrong.
     """
 
     topic: str
@@ -62,11 +63,11 @@ class Stored(NamedTuple):
 def stored_messages(
     folder: Path, complain: Callable[[str], object] = lambda _: None, only: str | None = None
 ) -> Iterator[Stored]:
-    """All messages in the files of a bag's folder, as far as they go.
+    """All messages of a bag that can be read.
 
     Args:
-        complain: told in one sentence of each part of a file that is not as it was written.
-        only: the topic of which the messages are read; all if ``None``.
+        complain: receives a sentence for each damaged part of a file.
+        only: the topic to read; all if ``None``.
     """
     files, metadata = _mcap_files(folder), folder / "metadata.yaml"
     if not files or (metadata.exists() and _BY_MESSAGE.search(read_bytes(metadata))):
@@ -82,16 +83,16 @@ def stored_messages(
         with open_ordinary(path) as file:
             try:
                 summary, is_whole = _summary_of(file), True
-            except Exception:  # the end is missing or damaged, and mcap may raise anything
+            except Exception:  # of a damaged file, mcap may raise anything
                 summary, is_whole = Summary(), False
             yield from _of_mcap(file, summary, complain, only, has_index=is_whole)
 
 
 def faults_of(folder: Path, counts: Mapping[str, int]) -> list[str]:
-    """What is not as it was written, a sentence each; reads all of a bag.
+    """A sentence for each damage of a bag; reads all of it.
 
     Args:
-        counts: by topic, how many messages there should be.
+        counts: by topic, how many messages the bag should have.
     """
     faults: list[str] = []
     found = Counter(message.topic for message in stored_messages(folder, faults.append))
@@ -103,12 +104,12 @@ def faults_of(folder: Path, counts: Mapping[str, int]) -> list[str]:
 
 
 def are_left(folder: Path, topic: str, count: int, left: int) -> str:
-    """A sentence on messages that are not there."""
+    """A sentence on missing messages."""
     return f"{folder}: of {count} packets of {topic} {left} are left"
 
 
 def is_whole(folder: Path) -> bool:
-    """Whether readers will open a bag: metadata, beginning and end of its files, and types."""
+    """Whether metadata, types, beginning and end of the files of a bag can be read."""
     try:
         with opened(folder) as reader, damage_of(folder):
             store_of(reader.connections)
@@ -127,7 +128,7 @@ class Contents(NamedTuple):
 
 
 def contents_of(folder: Path) -> Contents:
-    """What metadata and index of a bag say; of a bag that was cut off, what its file has.
+    """Read the metadata and index of a bag; of a bag that was cut off, all of its file.
 
     Raises:
         EnvironmentFault: if it cannot be read.
@@ -163,10 +164,10 @@ def contents_of(folder: Path) -> Contents:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[Reader]:
-    """A bag as ``rosbags`` opens it.
+    """Open a bag with ``rosbags``.
 
     Raises:
-        EnvironmentFault: if it cannot.
+        EnvironmentFault: if that fails.
     """
     with ExitStack() as stack:
         with damage_of(folder):
@@ -183,12 +184,12 @@ def opened(folder: Path) -> Iterator[Reader]:
 
 
 def store_of(connections: Iterable[Connection]) -> Typestore:
-    """The types as a bag defines them, else as they are installed (ROS 2 before Iron).
+    """The types that a bag defines; types without a definition (before Iron) as installed.
 
     Raises:
         EnvironmentFault: if a type is neither defined nor installed.
-        ReaderError: if one lacks a part.
-        Exception: whatever the parser raises.
+        ReaderError: if a definition lacks the type of a field.
+        Exception: of any kind, if a definition cannot be parsed.
     """
     store = get_typestore(Stores.EMPTY)
     types: dict[str, Any] = {}
@@ -206,10 +207,10 @@ def store_of(connections: Iterable[Connection]) -> Typestore:
 
 @contextmanager
 def damage_of(folder: Path, what: str = "") -> Iterator[None]:
-    """Turn what ``rosbags`` raises for a bag into ``EnvironmentFault``; that may be anything.
+    """Turn any exception of ``rosbags`` into ``EnvironmentFault``.
 
     Args:
-        what: the part of the bag that is read; all of it if empty.
+        what: the part of the bag that is read; empty: all of it.
     """
     try:
         yield
@@ -225,7 +226,7 @@ def _check_definitions(reader: Reader) -> None:
     """Raise ``ReaderError`` where metadata and files do not agree."""
     folder = reader.storage if isinstance(reader.storage, DirectoryReader) else None
     if folder and not isinstance(folder.files, list):
-        folder.files = []  # else it could not be closed
+        folder.files = []  # close() needs a list
         raise ReaderError("in metadata.yaml, files is no list")
     storages = folder.storages if folder else ()
     stored = [each for storage in storages for each in storage.connections]
@@ -279,9 +280,9 @@ def _of_mcap(
     *,
     has_index: bool,
 ) -> Iterator[Stored]:
-    """Messages in the order of the file; ``known`` grows by its schemas and channels."""
+    """Messages in the order of the file; schemas and channels are added to ``known``."""
     file.seek(0)
-    if not MCAP0_MAGIC.startswith(file.read(len(MCAP0_MAGIC))):  # else it has been cut off
+    if not MCAP0_MAGIC.startswith(file.read(len(MCAP0_MAGIC))):  # shorter: it was cut off
         complain(f"{file.name} does not begin as an MCAP file")
     is_indexed = has_index and bool(known.chunk_indexes)
     for kind, start, end in _indexed(known, only) if is_indexed else _one_by_one(file):
@@ -301,7 +302,7 @@ def _of_mcap(
 
 
 def _indexed(summary: Summary, only: str | None) -> Iterator[tuple[int, int, int]]:
-    """Chunks that have the topic: kind of record, where it begins, where it ends."""
+    """Chunks that have the topic: kind of record, start and end in bytes."""
     topics = {channel.id: channel.topic for channel in summary.channels.values()}
     for index in summary.chunk_indexes:
         # Without an index of its messages, a chunk may have any topic.
@@ -312,7 +313,7 @@ def _indexed(summary: Summary, only: str | None) -> Iterator[tuple[int, int, int
 
 
 def _one_by_one(file: BinaryIO) -> Iterator[tuple[int, int, int]]:
-    """Whole chunks, and records that are in none: kind, where it begins, where it ends."""
+    """Whole chunks, and records outside of chunks: kind, start and end in bytes."""
     at, size = len(MCAP0_MAGIC), os.fstat(file.fileno()).st_size
     while at + _RECORD_HEAD.size <= size:
         file.seek(at)
@@ -326,7 +327,7 @@ def _one_by_one(file: BinaryIO) -> Iterator[tuple[int, int, int]]:
 
 
 def _records_of(kind: int, file: BinaryIO, start: int, end: int) -> tuple[list[McapRecord], bool]:
-    """A record, or those of a chunk, and whether it is as it was written."""
+    """A record, or those of a chunk, and whether its checksum is right."""
     try:
         file.seek(start + _RECORD_HEAD.size)
         size = min(end, os.fstat(file.fileno()).st_size) - file.tell()

@@ -1,9 +1,9 @@
 """System load of a run: processor, memory and threads of the machine and of each node.
 
-Which processes are a node's is told by the environment that they were started with, which their
-children inherit wherever they run: in a process, in a container (its processes are visible on the
-host), behind a double fork. A child that was started without it counts to its parent's group. Each
-process of the machine is looked at when it is new; after that, only those of the run are.
+The environment of a process tells its node. Children inherit it wherever they run: in a process, in
+a container (its processes are visible on the host), behind a double fork. A child that was started
+without it counts to its parent's group. Each process of the machine is read when it is new, and
+later only if it belongs to the run.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from neuros.ordinary_files import open_new
 FILE_NAME = "system_load.csv"
 
 LAUNCHER = "launcher"
-"""The group of the launcher itself, its reaper, and all else that it starts."""
+"""The group of the launcher, its reaper, and other programs that it starts."""
 
 PERIOD_S = 1.0
 
-# A process that is just being started has still the environment of who starts it.
-_LOOKS = 3
+# A process that has just been forked still has the environment of its parent.
+_TRIES = 3
 
 Owner = Callable[[Mapping[str, str]], str | None]
 """From the environment of a process to its group, ``None`` if it does not belong to the run."""
@@ -45,8 +45,8 @@ class GroupLoad(NamedTuple):
     """Load of the processes of one node.
 
     Attributes:
-        cpu_s: processor time since they exist, that of children that have ended included.
-        memory_bytes: resident memory; what processes share counts in each of them.
+        cpu_s: processor time since their start, with that of children that have ended.
+        memory_bytes: resident memory; shared memory counts in each process.
     """
 
     cpu_s: float
@@ -58,9 +58,9 @@ class MachineLoad(NamedTuple):
     """Load of the whole machine.
 
     Attributes:
-        core_percent: by core, since the last time.
-        network_sent_bytes, network_received_bytes: of all interfaces together, the loopback too,
-            since the machine was started.
+        core_percent: by core, since the last reading.
+        network_sent_bytes, network_received_bytes: of all interfaces, with the loopback, since the
+            machine was started.
     """
 
     core_percent: tuple[float, ...]
@@ -71,7 +71,7 @@ class MachineLoad(NamedTuple):
 
 
 class LoadTable:
-    """Turns readings into rows, and remembers what the summary needs.
+    """Turns readings into rows and a summary.
 
     Args:
         groups: the groups of processes, in the order of their columns.
@@ -100,7 +100,7 @@ class LoadTable:
         ]
 
     def begin(self, time_s: float, machine: MachineLoad, groups: Mapping[str, GroupLoad]) -> None:
-        """The first reading: processor time and network count from here."""
+        """Set the reading that processor time and network count from."""
         self._last = (time_s, machine, groups)
 
     def row(
@@ -110,9 +110,9 @@ class LoadTable:
         assert self._last is not None
         last_s, before, groups_before = self._last
         self._last = (time_s, machine, groups)
-        self._machine.note(sum(machine.core_percent), machine.memory_used_bytes)
+        self._machine.add(sum(machine.core_percent), machine.memory_used_bytes)
         cells = [f"{percent:.1f}" for percent in machine.core_percent[: self._cores]]
-        cells += [""] * (self._cores - len(cells))  # a core that has been taken offline
+        cells += [""] * (self._cores - len(cells))  # cores that have been switched off
         cells += [
             str(machine.memory_used_bytes),
             f"{machine.memory_percent:.1f}",
@@ -126,12 +126,12 @@ class LoadTable:
                 continue
             spent_s = load.cpu_s - (load_before.cpu_s if load_before else 0.0)
             percent = max(0.0, 100 * spent_s / max(time_s - last_s, 1e-9))
-            self._figures[name].note(percent, load.memory_bytes, load.threads)
+            self._figures[name].add(percent, load.memory_bytes, load.threads)
             cells += [f"{percent:.1f}", str(load.memory_bytes), str(load.threads)]
         return cells
 
     def summary(self) -> dict[str, Any]:
-        """Means and maxima, ready for JSON; a group that was never seen has ``None``."""
+        """Means and maxima, ready for JSON; ``None`` for a group that never had a process."""
         machine = self._machine.summary("memory_used_bytes_max")
         processes = {name: x.summary("memory_bytes_max") for name, x in self._figures.items()}
         for name, load in processes.items():
@@ -155,7 +155,7 @@ class _Extremes:
     memory_bytes: int = 0
     threads: int = 0
 
-    def note(self, percent: float, memory_bytes: int, threads: int = 0) -> None:
+    def add(self, percent: float, memory_bytes: int, threads: int = 0) -> None:
         self.count += 1
         self.percent_sum += percent
         self.percent = max(self.percent, percent)
@@ -174,7 +174,7 @@ class _Extremes:
 
 
 def load_table(summary: Mapping[str, Any]) -> str:
-    """The summary as text; one line where there is nothing to sum up."""
+    """The summary as text; one line for a run without a sample."""
     from tabulate import tabulate
 
     machine = summary["machine"]
@@ -211,12 +211,12 @@ class LoadMeter:
     def __init__(self, owner: Owner) -> None:
         self._owner = owner
         self._members: dict[int, _Member] = {}
-        self._looks: dict[int, int] = {}
+        self._tries: dict[int, int] = {}
         self._launcher = psutil.Process()
-        psutil.cpu_percent(percpu=True)  # it counts from here
+        psutil.cpu_percent(percpu=True)  # the first call sets the time to count from
 
     def machine(self) -> MachineLoad:
-        """The load of the machine since this was last asked."""
+        """The load of the machine since the last call."""
         memory, network = psutil.virtual_memory(), psutil.net_io_counters()
         return MachineLoad(
             core_percent=tuple(psutil.cpu_percent(percpu=True)),
@@ -245,32 +245,28 @@ class LoadMeter:
         """The processes of the run, and their groups."""
         pids = set(psutil.pids())
         self._members = {pid: member for pid, member in self._members.items() if pid in pids}
-        self._looks = {pid: looks for pid, looks in self._looks.items() if pid in pids}
+        self._tries = {pid: tries for pid, tries in self._tries.items() if pid in pids}
         adopted: dict[int, _Member] = {}
         for pid in sorted(pids):
-            if pid == os.getpid() or pid in self._members or self._looks.get(pid, 0) >= _LOOKS:
+            if pid == os.getpid() or pid in self._members or self._tries.get(pid, 0) >= _TRIES:
                 continue
+            group, parent = None, 0
             try:
-                self._look_at(psutil.Process(pid), adopted)
+                process = psutil.Process(pid)
+                parent = process.ppid()
+                group = self._owner(process.environ())
             except psutil.Error:  # gone, or another user's
-                self._looks[pid] = self._looks.get(pid, 0) + 1
+                pass
+            known = self._members.get(parent) or adopted.get(parent)
+            if group is not None:
+                self._members[pid] = (process, group)
+            elif known is not None:
+                adopted[pid] = (process, known[1])
+            elif parent == os.getpid():
+                adopted[pid] = (process, LAUNCHER)
+            else:
+                self._tries[pid] = self._tries.get(pid, 0) + 1
         return [*self._members.values(), *adopted.values()]
-
-    def _look_at(self, process: psutil.Process, adopted: dict[int, _Member]) -> None:
-        parent = process.ppid()
-        known = self._members.get(parent) or adopted.get(parent)
-        try:
-            group = self._owner(process.environ())
-        except psutil.Error:
-            group = None
-        if group is not None:
-            self._members[process.pid] = (process, group)
-        elif known is not None:
-            adopted[process.pid] = (process, known[1])
-        elif parent == os.getpid():
-            adopted[process.pid] = (process, LAUNCHER)
-        else:
-            self._looks[process.pid] = self._looks.get(process.pid, 0) + 1
 
 
 def _load_of(process: psutil.Process, *, with_children: bool) -> GroupLoad | None:

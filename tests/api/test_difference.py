@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from neuros.api.run_record import PastRun, open_run, open_whole
-from neuros.api.verify import Verdict, compare, differing_fields
+from neuros.api.verify import RunComparison, compare, differing_fields
 from neuros.errors import EnvironmentFault, UsageError
 
 FIRST, SECOND = "a.out -> b.in", "b.out -> c.in"
@@ -87,13 +87,13 @@ class Bags:
         return self.are_small
 
 
-def verdict(a: PastRun, b: PastRun, bags: Bags | None = None) -> Verdict:
+def verdict(a: PastRun, b: PastRun, bags: Bags | None = None) -> RunComparison:
     return compare(a, b, bags or Bags())
 
 
 def test_runs_with_the_same_packets_are_identical(folders: tuple[Path, Path]) -> None:
     a, b = (run(folder, {FIRST: [1, 2], SECOND: [3]}) for folder in folders)
-    assert verdict(a, b) == Verdict(None, (), 3)
+    assert verdict(a, b) == RunComparison(None, (), 3)
 
 
 def test_the_first_packet_that_differs_is_named(folders: tuple[Path, Path]) -> None:
@@ -222,7 +222,7 @@ def test_a_bag_stands_beside_digests_where_both_are_made_alike(
         assert found.difference is None
         assert found.compared == (2 if are_small else 0)
     bags = Bags({a.folder: {FIRST: [7, 8]}, b.folder: {FIRST: [7, 8]}}, are_small=are_small)
-    assert verdict(a, b, bags) == Verdict(None, (), 2), "both are taken from their bags"
+    assert verdict(a, b, bags) == RunComparison(None, (), 2), "both are taken from their bags"
 
 
 def test_what_is_missing_in_a_bag_is_not_said_to_be_identical(folders: tuple[Path, Path]) -> None:

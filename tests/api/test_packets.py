@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuros.api.packets import Packets, packet_figures, read_packets
+from neuros.api.packets import PacketLists, packet_figures, read_packets
 from neuros.project.model import Connection
 
 MS = 1_000_000
@@ -21,8 +21,8 @@ def packets(
     received: Sequence[int] = (),
     taken: Sequence[int] = (),
     taken_ms: Sequence[float] = (),
-) -> Packets:
-    return Packets(
+) -> PacketLists:
+    return PacketLists(
         np.array(np.array(sent_ms) * MS, np.int64),
         np.array(sent, np.uint64),
         np.array(received, np.uint64),
@@ -31,7 +31,7 @@ def packets(
     )
 
 
-def latencies_ms(found: Packets, *, may_lose: bool) -> list[float] | None:
+def latencies_ms(found: PacketLists, *, may_lose: bool) -> list[float] | None:
     latencies_ns = found.latencies_ns(may_lose=may_lose)
     return None if latencies_ns is None else list(latencies_ns / MS)
 
@@ -116,9 +116,9 @@ def test_files_are_read_as_far_as_they_were_written(tmp_path: Path) -> None:
     assert len(found.sent) == len(found.received) == 0
 
 
-def without_the_first(found: Packets, sent: int, received: int, taken: int) -> Packets:
+def without_the_first(found: PacketLists, sent: int, received: int, taken: int) -> PacketLists:
     """The lists of a run that has not kept so many entries of each."""
-    return Packets(
+    return PacketLists(
         found.sent_ns[sent:],
         found.sent[sent:],
         found.received[received:],

@@ -12,7 +12,7 @@ import neuros.bag
 from neuros.project.model import Connection, Node, Port, Project
 from neuros.project.names import Names
 from neuros.project.qos import PRESETS, Qos
-from neuros.recording.recording_plan import RecordingPlan, Request, Topic, plan_recording
+from neuros.recording.recording_plan import RecordingPlan, RecordingRequest, Topic, plan_recording
 
 INT = "std_msgs/msg/Int32"
 LATCHED = Qos("reliable", "transient_local", 1)
@@ -33,7 +33,7 @@ def planned(names: Names) -> RecordingPlan:
     b = Node("b", "neuros_python", Path("b.py"), inputs=(Port("n", INT),))
     wire = Connection("a", "n", "b", "n", 0, namespace=names.namespace)
     project = Project("p", (a, b), (wire,), Path("project.json"), names=names)
-    return plan_recording(project, ("a", "b"), Request(True), is_alone=False, custom={})
+    return plan_recording(project, ("a", "b"), RecordingRequest(True), is_alone=False, custom={})
 
 
 def test_topics_are_recorded_with_the_quality_of_service_that_the_project_says() -> None:

@@ -24,7 +24,7 @@ import neuros.bag
 from neuros.errors import EnvironmentFault
 from neuros.recording import recorder as recording
 from neuros.recording.recorder import Recorder, repair
-from neuros.recording.recording_plan import RecordingPlan, Stream, Topic, load_plan
+from neuros.recording.recording_plan import RecordedStream, RecordingPlan, Topic, load_plan
 from neuros.recording.spool import NO_TIME, ListenedSpool, SpoolWriter
 from neuros.recording.stored import Stored, stored_messages
 
@@ -154,7 +154,9 @@ def test_spools_are_gone_when_their_packets_are_in_the_bag(tmp_path: Path) -> No
 def test_a_type_without_definition_is_said_and_the_others_are_recorded(tmp_path: Path) -> None:
     what = RecordingPlan(
         topics=(Topic("/odd", "odd_msgs/msg/Odd"), ANSWER),
-        streams={"b": (Stream("sent", "odd", (0,)), Stream("sent", "answer", (1,)))},
+        streams={
+            "b": (RecordedStream("sent", "odd", (0,)), RecordedStream("sent", "answer", (1,)))
+        },
     )
     spool(tmp_path, "b", [(10, None, b"whatever")])
     complaints: list[str] = []
@@ -356,7 +358,7 @@ def test_a_damaged_list_of_topics_costs_nothing(
     heard = Topic("/heard", NUMBER.type)
     plan().save(tmp_path)
     recorder = Recorder(plan(), tmp_path, fail)
-    recorder.copy(heard, Stored("/heard", 5, 5, number(5)))
+    recorder.bag.put(recorder.number_of(heard) or 0, 5, 5, number(5))
     recorder.bag.flush()
     recorder.abandon()
     spool(tmp_path, "a", [(10, None, number(7))])

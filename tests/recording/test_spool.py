@@ -13,10 +13,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuros.ports import Way
-from neuros.recording.recording_plan import Stream
-from neuros.recording.spool import NO_TIME, Record, SpoolReader, SpoolWriter
+from neuros.recording.recording_plan import RecordedStream
+from neuros.recording.spool import NO_TIME, SpoolReader, SpoolRecord, SpoolWriter
 
-STREAMS = (Stream("sent", "imu", (0,)), Stream("heard", "camera", (1,)))
+STREAMS = (RecordedStream("sent", "imu", (0,)), RecordedStream("heard", "camera", (1,)))
 IMU, CAMERA = range(2)
 
 
@@ -25,7 +25,7 @@ def writer(folder: Path, file_bytes: int = 1 << 20) -> SpoolWriter:
     return SpoolWriter(folder, STREAMS, file_bytes=file_bytes, clock=lambda: next(ticks) * 10)
 
 
-def read_all(reader: SpoolReader, most_bytes: int = 1 << 20) -> list[Record]:
+def read_all(reader: SpoolReader, most_bytes: int = 1 << 20) -> list[SpoolRecord]:
     records, has_more = reader.read(most_bytes)
     while has_more:
         more, has_more = reader.read(most_bytes)
@@ -42,8 +42,8 @@ def test_a_packet_is_read_with_its_stream_and_times(tmp_path: Path) -> None:
     spool.keep(IMU, b"one", None)
     spool.keep(CAMERA, b"two", 1.5)
     assert read_all(SpoolReader(tmp_path)) == [
-        Record(10, NO_TIME, 0, b"one"),
-        Record(20, 1_500_000_000, 1, b"two"),
+        SpoolRecord(10, NO_TIME, 0, b"one"),
+        SpoolRecord(20, 1_500_000_000, 1, b"two"),
     ]
 
 
@@ -90,7 +90,7 @@ def test_all_is_read_once_whatever_the_sizes_and_whenever_one_reads(
 ) -> None:
     folder = tmp_path_factory.mktemp("node")
     spool, reader = writer(folder, file_bytes), SpoolReader(folder)
-    found: list[Record] = []
+    found: list[SpoolRecord] = []
     for packet, is_read in zip(packets, reads, strict=False):
         spool.keep(IMU, packet, None)
         if is_read:

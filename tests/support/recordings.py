@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from neuros.recording.recorder import Recorder
-from neuros.recording.recording_plan import RecordingPlan, Stream, Topic
+from neuros.recording.recording_plan import RecordedStream, RecordingPlan, Topic
 from neuros.recording.spool import NO_TIME, SpoolWriter
 
 NUMBER = Topic("/neuros/a/number/b/number/data", "std_msgs/msg/Int32", True, 1, "a.number -> b.n")
@@ -19,8 +19,8 @@ def plan(time_owner: str | None = None, flush_interval: float = 1.0) -> Recordin
     return RecordingPlan(
         topics=(NUMBER, ALSO, ANSWER),
         streams={
-            "a": (Stream("sent", "number", (0, 1)),),
-            "b": (Stream("sent", "answer", (2,)),),
+            "a": (RecordedStream("sent", "number", (0, 1)),),
+            "b": (RecordedStream("sent", "answer", (2,)),),
         },
         time_owner=time_owner,
         custom={"run_id": "0123"},

@@ -20,7 +20,7 @@ import numpy as np
 from neuros.api.packets import (
     FOLDER,
     Numbers,
-    Packets,
+    PacketLists,
     may_have_lost,
     numbers_of,
     packet_figures,
@@ -126,7 +126,7 @@ class ReviewedRun(PastRun):
         return {name: spent for name, spent in found.items() if spent is not None}
 
     @cached_property
-    def packets(self) -> dict[str, Packets]:
+    def packets(self) -> dict[str, PacketLists]:
         """The packet lists of every connection."""
         return {name: read_packets(self.folder, end) for name, end in self.ends.items()}
 

@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 import neuros.bag
 from neuros.errors import UsageError
-from neuros.recording.recording_plan import RecordingPlan, Stream, Topic
+from neuros.recording.recording_plan import RecordedStream, RecordingPlan, Topic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = STORE.types
@@ -24,7 +24,7 @@ def dataset(run: Path, messages: list[Any], *, has_simulated_time: bool = True) 
     """Record messages of one type, a tenth of a second apart, and read them back."""
     kind = messages[0].__msgtype__
     topic = Topic("/t", kind)
-    streams = {"a": (Stream("sent", "t", (0,)),)}
+    streams = {"a": (RecordedStream("sent", "t", (0,)),)}
     times = [(10**9 + place, place * 10**8) for place in range(len(messages))]
     packets = [
         (wall, sim if has_simulated_time else None, bytes(STORE.serialize_cdr(message, kind)))
