@@ -42,7 +42,7 @@ __all__ = ["Bag", "RawPacket", "RecordedTopic", "open"]
 
 
 class RawPacket(NamedTuple):
-    """A packet as it was recorded: wall time and simulated time in nanoseconds, and CDR."""
+    """A recorded packet: wall time and simulated time in nanoseconds, and bytes of CDR."""
 
     log_time_ns: int
     publish_time_ns: int
@@ -56,8 +56,8 @@ class RecordedTopic:
         name: the topic.
         type: its message type in ROS notation.
         connection: ``a.out -> b.in``, or ``None`` for a topic that belongs to none.
-        is_reliable, depth, is_latched: of the quality of service that was offered.
-        count: how many packets there are.
+        is_reliable, depth, is_latched: of the offered quality of service.
+        count: how many packets the topic has.
     """
 
     def __init__(self, bag: Bag, recorded: Connection, connection: str | None) -> None:
@@ -74,11 +74,11 @@ class RecordedTopic:
         self.depth = max((p.depth for p in profiles), default=0) or 10
 
     def raw(self) -> list[RawPacket]:
-        """All packets as they were recorded."""
+        """All packets, in the order of their wall time."""
         return self._bag.packets_of(self.name)
 
     def messages(self) -> Iterator[tuple[RawPacket, Any]]:
-        """Packets and messages, made by ``rosbags`` one by one."""
+        """Packets with their messages, which ``rosbags`` decodes one by one."""
         for packet in self.raw():
             yield packet, self._bag.message(packet.data, self.type)
 
@@ -168,11 +168,11 @@ class Bag:
     Attributes:
         folder: the rosbag2 folder.
         topics: by name, in the order of the project.
-        custom: what its metadata says of the run: ``run_id``, ``project``, ``project_sha256``,
-            ``versions``, ``seeds``.
+        custom: metadata of the run: ``run_id``, ``project``, ``project_sha256``, ``versions``,
+            ``seeds``.
         start_ns: wall time of the first packet, in nanoseconds since 1970.
         duration_s: from the first packet to the last.
-        missing: by topic, how many packets were in the bag when the run ended, and are not now.
+        missing: by topic, how many packets the bag has lost since the run ended.
     """
 
     def __init__(
@@ -203,17 +203,17 @@ class Bag:
         return f"{self.folder} has been damaged since the run; packets that are missing: {missing}"
 
     def check(self) -> str | None:
-        """What is wrong with the bag, in a sentence; reads all of it."""
+        """Read all of the bag; returns its damage in a sentence, ``None`` if there is none."""
         faults = faults_of(self.folder, {name: topic.count for name, topic in self.topics.items()})
         return "; ".join([*([self.damage] if self.damage else []), *faults]) or None
 
     def expect(self, name: str, left: int) -> None:
-        """Refuse fewer packets of a topic than there should be."""
+        """Raise ``EnvironmentFault`` if a topic has fewer packets than the metadata counts."""
         if left < (count := self.topics[name].count):
             self.refuse(are_left(self.folder, name, count, left))
 
     def refuse(self, fault: str) -> None:
-        """Raise a fault of its files, which readers of packets cannot pass over."""
+        """Raise ``EnvironmentFault`` for damage that was found while packets were read."""
         raise EnvironmentFault(
             f"{fault}: its content has changed since it was recorded (`neuros bag repair` keeps"
             " the packets that can be read)"
@@ -227,11 +227,11 @@ class Bag:
     def __getitem__(self, name: str) -> RecordedTopic:
         """The topic of that name, of that connection, or of that output.
 
-        An output sends the same packets to all its receivers; of a run that was cut off, the
-        connection that came furthest is taken.
+        An output sends the same packets to all its receivers; of its connections, the one with most
+        packets is returned, since they may differ in a run that was cut off.
 
         Raises:
-            KeyError: if there is none; its text names those that there are.
+            KeyError: if there is none; the text names all topics.
         """
         if name in self.topics:
             return self.topics[name]
@@ -262,7 +262,7 @@ class Bag:
         return self._packets[name]
 
     def close(self) -> None:
-        """Let go of what has been read."""
+        """Release the packets that have been read."""
         self._packets.clear()
 
     def __enter__(self) -> Bag:
@@ -275,13 +275,13 @@ class Bag:
 def open(run: str | os.PathLike[str]) -> Bag:
     """Open the bag of a run; one that was cut off is completed first.
 
-    Warns where packets are missing that were there when the run ended.
+    Warns if packets have been lost since the run ended.
 
     Args:
         run: the run folder, or a rosbag2 folder.
 
     Raises:
-        UsageError: if there is none, or this version of NeuROS cannot read it.
+        UsageError: if there is no bag, or this version of NeuROS cannot read it.
         EnvironmentFault: if it is damaged.
     """
     bag = open_bag(run)

@@ -56,12 +56,11 @@ class _Pose:
 class TransformBuffer:
     """Keeps transforms for a while and chains them.
 
-    Time that goes back, as that of a simulator which is reset, begins anew: a transform with an
-    earlier stamp than the one before it of the same frame drops all that lie after it, of every
-    frame. Static ones stay.
+    Time may go back, as at the reset of a simulator: a transform with an earlier stamp than the
+    last one of its frame removes all later transforms of every frame, but for static ones.
 
     Args:
-        cache_s: how long those of ``/tf`` are kept behind the newest one of the same frame.
+        cache_s: how long transforms of ``/tf`` are kept behind the newest one of the frame.
     """
 
     def __init__(self, cache_s: float = 10.0) -> None:
@@ -71,10 +70,10 @@ class TransformBuffer:
         self._static: set[str] = set()
 
     def add(self, message: Any, *, is_static: bool = False) -> None:
-        """Take in a ``TFMessage``, or one ``TransformStamped``.
+        """Add the transforms of a ``TFMessage``, or one ``TransformStamped``.
 
         Args:
-            is_static: it holds for ever, as those of ``/tf_static`` do.
+            is_static: whether it is valid at any time, as those of ``/tf_static``.
         """
         for stamped in getattr(message, "transforms", (message,)):
             self._add(stamped, is_static)
@@ -85,8 +84,8 @@ class TransformBuffer:
         Its rotation and translation take a point from ``source`` to ``target``.
 
         Args:
-            at: a ``builtin_interfaces/msg/Time``; between two transforms it is interpolated.
-                ``None``: the newest time for which all transforms on the way are known.
+            at: a ``builtin_interfaces/msg/Time``; transforms before and after it are interpolated.
+                ``None``: the newest time at which all transforms between the frames are known.
 
         Raises:
             TransformError: if the frames are not connected, or not at that time.
@@ -118,20 +117,17 @@ class TransformBuffer:
         self._static.add(frame) if is_static else self._static.discard(frame)
         poses = self._poses[frame]
         if poses and pose < poses[-1]:
-            self._go_back_to(pose)
+            for other, later in self._poses.items():
+                if other not in self._static:
+                    del later[bisect_right(later, pose) :]
         if poses and poses[-1] == pose:  # of the same time
             del poses[-1]
         poses.append(pose)
         while poses[-1].at_ns - poses[0].at_ns > self._cache_ns:
             del poses[0]
 
-    def _go_back_to(self, pose: _Pose) -> None:
-        for frame, poses in self._poses.items():
-            if frame not in self._static:
-                del poses[bisect_right(poses, pose) :]
-
     def _way(self, target: str, source: str) -> tuple[list[str], list[str]]:
-        """The frames from the target, and from the source, to what both are in."""
+        """The frames from the target, and from the source, up to their common ancestor."""
         target, source = _plain(target), _plain(source)
         known = {*self._parents, *self._parents.values()}
         for frame in (target, source):
@@ -213,7 +209,7 @@ def _parts(message: Any) -> tuple[Vector, Quaternion]:
 
 
 def _plain(frame: str) -> str:
-    """Frames of ROS 1 begin with a slash, which means nothing today."""
+    """A name without the leading slash of ROS 1."""
     return frame.removeprefix("/")
 
 
@@ -235,7 +231,7 @@ def _rotate(q: Quaternion, v: Vector) -> Vector:
 
 
 def _between(a: _Pose, b: _Pose, at_ns: int) -> _Pose:
-    """Linear in place; on the shorter arc, at constant speed, in rotation (Shoemake, 1985)."""
+    """Interpolate: linearly in translation, on the shorter arc in rotation (Shoemake, 1985)."""
     share = (at_ns - a.at_ns) / (b.at_ns - a.at_ns)
     x, y, z = (p + share * (q - p) for p, q in zip(a.translation, b.translation, strict=True))
     cosine = sum(p * q for p, q in zip(a.rotation, b.rotation, strict=True))

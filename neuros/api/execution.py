@@ -158,7 +158,13 @@ class Execution:
         outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
         recording = None
         try:
-            self._greet()
+            self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
+            commands = f"neuros topic list {self._run_id[:8]}"
+            if not self._plan.request.isolate:
+                commands += f", or ROS_DOMAIN_ID={self._domain.id} ros2 topic list"
+            self._console.log("INFO", f"to look into it: {commands}")
+            for severity, notice in self._plan.notices:
+                self._console.log(severity, notice)
             if self._recording_plan is not None:
                 recording = Recording(
                     self._recording_plan, self._run_id, self.folder, self._beside(), reaper
@@ -197,16 +203,6 @@ class Execution:
         is_good = outcome.exit_code in (0, *_ENDED_BY_SIGNAL)
         self._console.log("INFO" if is_good else "ERROR", outcome.reason)
         return record
-
-    def _greet(self) -> None:
-        """Log domain and folder of the run, commands that show its topics, and notices."""
-        self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
-        text = f"to look into it: neuros topic list {self._run_id[:8]}"
-        if not self._plan.request.isolate:
-            text += f", or ROS_DOMAIN_ID={self._domain.id} ros2 topic list"
-        self._console.log("INFO", text)
-        for severity, notice in self._plan.notices:
-            self._console.log(severity, notice)
 
     def _stop(
         self, outcome: Outcome, recording: Recording | None, observation: Observation

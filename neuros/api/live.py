@@ -12,7 +12,7 @@ import threading
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any
 
 from neuros.api.execution import Execution
 from neuros.api.plan import Plan
@@ -20,17 +20,17 @@ from neuros.api.run import Run
 
 
 class LiveRun:
-    """A run in a thread of its own, from :meth:`begin` on; :meth:`wait` gives what comes out.
+    """A run in a thread of its own, from :meth:`begin` on; :meth:`wait` returns the result.
 
-    As a context manager it is stopped at the end of the block, and waited for::
+    As a context manager, the end of the block stops the run and waits for its end::
 
         with project.start(backend="process") as run:
             ...
         print(run.wait())
 
-    It installs no signal handlers: where a program or a notebook is interrupted while it waits,
-    the run is ended as by Ctrl+C, and then ``KeyboardInterrupt`` goes on. A program that ends
-    ends its runs. Several may go on at once.
+    It installs no signal handlers: an interrupt of a program or notebook that waits ends the run as
+    Ctrl+C does, and then raises ``KeyboardInterrupt``. A program that ends, ends its runs. Several
+    runs may go on at once.
 
     Raises:
         UsageError, EnvironmentFault: if it cannot begin.
@@ -42,13 +42,15 @@ class LiveRun:
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._done = threading.Event()
-        # Held by the thread that executes the run, or by the call that cancels it before.
+        # Held by the thread that executes the run, or by a call that cancels it before.
         self._claim = threading.Lock()
         self._error: BaseException | None = None
+        output: Any = _CurrentOutput()
         try:
             self._execution = Execution(
                 plan,
-                _shown_on() if is_shown else None,
+                # A file only if standard output is that of the program.
+                (sys.stdout if sys.stdout is sys.__stdout__ else output) if is_shown else None,
                 self._signals,
                 self._reader,
                 self._wishes,
@@ -58,7 +60,7 @@ class LiveRun:
             raise
 
     def begin(self) -> None:
-        """Start it; only then is there something that has to be ended."""
+        """Start the run; from now on it has to be ended."""
         try:
             atexit.register(self._end_with_program)
             threading.Thread(target=self._execute, name="neuros-run", daemon=True).start()
@@ -78,26 +80,26 @@ class LiveRun:
 
     @property
     def is_running(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether the run has not ended yet."""
         return not self._done.is_set()
 
     def stop(self, reason: str = "stopped by the program") -> None:
-        """Ask for its end, as if ``--duration`` were over: drained, with exit code 0."""
+        """End the run as if ``--duration`` were over: drained, with exit code 0."""
         self._wishes.append(reason)
         self._wake()
 
     def interrupt(self) -> None:
-        """Do what Ctrl+C does: end it now, with exit code 130; a second time kills at once."""
+        """Do what Ctrl+C does: end the run now, with exit code 130; a second call kills it."""
         self._signals.append(signal.SIGINT)
         self._wake()
 
     def wait(self, timeout_s: float | None = None) -> Run:
-        """Wait for its end.
+        """Wait for the end of the run.
 
         Raises:
-            TimeoutError: if it has not ended after ``timeout_s``; it goes on.
-            EnvironmentFault: if it could not be started.
-            KeyboardInterrupt: if that came while waiting; the run has then been ended in order.
+            TimeoutError: if the run has not ended after ``timeout_s`` seconds; it goes on.
+            EnvironmentFault: if the run could not be started.
+            KeyboardInterrupt: if interrupted; the run has then been ended in order.
         """
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         interrupted: KeyboardInterrupt | None = None
@@ -117,7 +119,7 @@ class LiveRun:
         return Run(self.folder)
 
     def end(self) -> None:
-        """Have it ended as by Ctrl+C, and wait; one that has not begun never does."""
+        """End the run as Ctrl+C does, and wait; a run that has not begun never does."""
         if self._claim.acquire(blocking=False):
             self._execution.cancel()
             self._finish()
@@ -126,7 +128,7 @@ class LiveRun:
         self.join()
 
     def join(self) -> None:
-        """Wait for its end, and no more."""
+        """Wait for the end of the run."""
         self._done.wait()
 
     def __enter__(self) -> LiveRun:
@@ -163,7 +165,7 @@ class LiveRun:
         self._done.set()
 
     def _wake(self) -> None:
-        with contextlib.suppress(OSError):  # it has ended, or is awake in any case
+        with contextlib.suppress(OSError):  # the run has ended, or is awake
             self._writer.send(b"\0")
 
     def _hang_up(self) -> None:
@@ -175,8 +177,8 @@ class LiveRun:
         self._done.wait()
 
 
-class _Through(io.TextIOBase):
-    """Writes to the current ``sys.stdout``: a cell of a notebook, or what pytest captures."""
+class _CurrentOutput(io.TextIOBase):
+    """Writes to the current ``sys.stdout``: a cell of a notebook, or the capture of pytest."""
 
     encoding = "utf-8"
 
@@ -184,8 +186,3 @@ class _Through(io.TextIOBase):
         sys.stdout.write(text)
         sys.stdout.flush()
         return len(text)
-
-
-def _shown_on() -> TextIO | Any:
-    """Standard output, as a file only where it is the program's own."""
-    return sys.stdout if sys.stdout is sys.__stdout__ else _Through()

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from importlib.util import find_spec
@@ -35,8 +36,8 @@ from neuros.recording.provenance import seeds
 from neuros.registry import NAMES, PLUGIN_CHECKS
 
 _LONG_BYTES = 1 << 20
-"""A file of a container's folder from this size on is data, not a recipe."""
-_CLOSE = 0.8  # difflib's similarity of besides and beside
+"""Larger files in the folder of a container are data, not a recipe."""
+_CLOSE = 0.8  # similarity in difflib's scale, as of besides and beside
 _MJCF = (".xml", ".mjcf")
 _MODELS = (*_MJCF, ".urdf", ".sdf", ".world")
 _PLACE = re.compile(r"(\S.*?):(\d+):(\d+): (.*)")
@@ -51,10 +52,13 @@ def load_with_messages(
     *,
     reads_plugins: bool = True,
 ) -> tuple[Loaded, Messages]:
-    """Load the project and find its message packages; ``reads_plugins``: look into plugins, too.
+    """Load a project and find its message packages.
+
+    Args:
+        reads_plugins: whether to read the source of plugins, too.
 
     Raises:
-        ProjectError: with all its problems, and those of its message files.
+        ProjectError: with all problems of the project and of its message files.
     """
     workspaces = workspaces_of(path)
     try:
@@ -84,8 +88,7 @@ def load_with_messages(
         if problems:
             raise ProjectError(problems)
     doubts = (
-        *_unknown_types(loaded, workspaces),
-        *_unknown_plugins(loaded),
+        *_unknown_in_containers(loaded.project, workspaces),
         *(doubt for node, check in checks for doubt in check.doubts(node)),
         *(foreseen_failures(loaded.project, messages, looks_beside=False) if reads_plugins else ()),
     )
@@ -93,12 +96,10 @@ def load_with_messages(
 
 
 def seed_variables(project: Project, seed: int) -> dict[str, dict[str, str]]:
-    """By node, the variables of its environment that give it this seed.
-
-    A seed is a variable in the ``environment`` of a node whose name contains SEED.
+    """By node, the variables with SEED in their names in its environment, set to this seed.
 
     Raises:
-        UsageError: if no node has one.
+        UsageError: if no node has such a variable.
     """
     found = seeds(project.nodes)
     if not found:
@@ -109,19 +110,11 @@ def seed_variables(project: Project, seed: int) -> dict[str, dict[str, str]]:
     return {name: dict.fromkeys(variables, str(int(seed))) for name, variables in found.items()}
 
 
-def _unknown_containers(project: Project) -> Iterator[Problem]:
-    """The containers that are probably meant to be others."""
+def _unknown_in_containers(project: Project, workspaces: Workspaces) -> Iterator[Problem]:
+    """Message types and plugins that are neither here nor named in the folder of a container."""
     for node in project.nodes:
-        text, hint = why_no_container(node.container, project.folder)
-        if text:
-            yield problem_in(node.file, f"{node.pointer}/container", text, hint)
-
-
-def _unknown_types(loaded: Loaded, workspaces: Workspaces) -> Iterator[Problem]:
-    """Message types that are not here, nor named in the folder of the node's container."""
-    for node in loaded.project.nodes:
-        container = find_container(node.container, loaded.project.folder)
-        if container is None or container.is_own:  # an image of the user's; or it was a mistake
+        container = find_container(node.container, project.folder)
+        if container is None or container.is_own:  # a mistake, or an image of the user
             continue
         for side, ports in (("inputs", node.inputs), ("outputs", node.outputs)):
             for index, port in enumerate(ports):
@@ -129,73 +122,60 @@ def _unknown_types(loaded: Loaded, workspaces: Workspaces) -> Iterator[Problem]:
                 package = port.type.partition("/")[0]
                 if unknown and not _names_package(container.folder, package):
                     yield problem_in(node.file, f"{node.pointer}/{side}/{index}/type", *unknown)
-
-
-def _unknown_plugins(loaded: Loaded) -> Iterator[Problem]:
-    """Modules that are not installed here, nor named in the folder of the node's container."""
-    for node in loaded.project.nodes:
-        container = find_container(node.container, loaded.project.folder)
-        if node.module and node.plugin == Path() and container and not container.is_own:
-            package = node.module.partition(".")[0]
-            if not _names_package(container.folder, package):
-                text, _ = why_no_module(node.module)
-                hint = f"nothing in {container.folder} names '{package}'"
-                yield problem_in(node.file, f"{node.pointer}/plugin", text, hint)
+        package = node.module.partition(".")[0]
+        is_elsewhere = node.module and node.plugin == Path()
+        if is_elsewhere and not _names_package(container.folder, package):
+            text, _ = why_no_module(node.module)
+            hint = f"nothing in {container.folder} names '{package}'"
+            yield problem_in(node.file, f"{node.pointer}/plugin", text, hint)
 
 
 def _names_package(folder: Path, package: str) -> bool:
-    """Whether a file of a container's folder names a package, as ROS or as Debian and pip do."""
+    """Whether a file in the folder of a container names a package, with ``_`` or ``-``."""
     files = [file for file in folder.iterdir() if file.is_file()]
     short = (file for file in files if file.stat().st_size < _LONG_BYTES)
     return any(package in file.read_text("utf-8", "replace").replace("-", "_") for file in short)
 
 
 def workspaces_of(project: Path) -> Workspaces:
-    """The workspaces that a project, a file or a folder, sees."""
+    """The workspaces that a project (its file or folder) uses."""
     folder = project if project.is_dir() else project.parent
     return Workspaces(folder.resolve() / "workspace", WORKSPACE, os.environ)
-
-
-# ---------------------------------------------------------------------- what would fail
 
 
 def foreseen_failures(
     project: Project, messages: Messages, *, looks_beside: bool = True
 ) -> list[Problem]:
-    """What does not keep a run from starting, but from going well: it will fail, or do nothing.
+    """Problems that let a run start, and then fail or do nothing.
 
-    ``validate`` refuses it. Before a run these are warnings, since what is in an image is not
-    known here.
+    These are unknown containers, loops, and modules that the Python of a plugin lacks. ``validate``
+    refuses them; before a run they are warnings, since the content of an image is not known here.
 
     Args:
-        looks_beside: also at what the modules beside a plugin import, which takes a while.
+        looks_beside: whether to read the imports of modules beside plugins, too, which takes long.
     """
-    return [
-        *_unknown_containers(project),
-        *Loops(project).problems(),
-        *_missing_modules(project, messages, looks_beside),
-    ]
-
-
-def _missing_modules(project: Project, messages: Messages, looks_beside: bool) -> list[Problem]:
-    """What plugins import, and the Python that they run on lacks."""
+    problems = []
+    for node in project.nodes:
+        text, hint = why_no_container(node.container, project.folder)
+        if text:
+            problems.append(problem_in(node.file, f"{node.pointer}/container", text, hint))
+    problems += Loops(project).problems()
     lacking = {
         node.name: found
         for node in project.nodes
         if node.script is None and (found := [*_lacking(node, project, messages, looks_beside)])
     }
-    if not lacking:
-        return []
-    try:
-        elsewhere = Pythons.choose(project.nodes, project.folder, os.environ).paths
-    except EnvironmentFault:  # a run says what is wrong with a container
-        return []
-    return [each for name, of in lacking.items() if name not in elsewhere for each in of]
+    if lacking:
+        with suppress(EnvironmentFault):  # a run tells what is wrong with a container
+            elsewhere = Pythons.choose(project.nodes, project.folder, os.environ).paths
+            problems += [p for name, of in lacking.items() if name not in elsewhere for p in of]
+    return problems
 
 
 def _lacking(
     node: Node, project: Project, messages: Messages, looks_beside: bool
 ) -> Iterator[Problem]:
+    """Modules that a plugin imports, and that its Python on this machine does not have."""
     path = node.environment.get("PYTHONPATH", "").split(os.pathsep)
     folders = [str(node.plugin.parent), *filter(None, path), *map(str, messages.paths)]
     built = {each.package for each in messages.built}
@@ -213,50 +193,50 @@ def _lacking(
                 if is_named and is_missing(top, folders):
                     continue
                 text = f"there is no module '{needed.name}'"
-                missing = NAMES.missing(needed.name.removeprefix("neuros."))
-                hint = missing or _place_of_module(top, node)
+                known = {*modules_here(), *(f.stem for f in node.plugin.parent.glob("*.py"))}
+                close = get_close_matches(top, known - {top}, 1, _CLOSE)
+                hint = NAMES.missing(needed.name.removeprefix("neuros.")) or (
+                    f"did you mean '{close[0]}'?"
+                    if close
+                    else f"packages such as {top} go into the requirements.txt of the node's"
+                    " container, modules of your own beside the plugin: docs/environments.md"
+                )
             if text:
                 place = needed.line, needed.column
                 yield Problem(display_name(part.path), *place, "", text, hint)
 
 
-def _place_of_module(name: str, node: Node) -> str:
-    """A hint for a module that is not there."""
-    beside = {file.stem for file in node.plugin.parent.glob("*.py")}
-    if close := get_close_matches(name, {*beside, *modules_here()} - {name}, 1, _CLOSE):
-        return f"did you mean '{close[0]}'?"
-    return (
-        f"packages such as {name} go into the requirements.txt of the node's container, modules of"
-        " your own beside the plugin: docs/environments.md"
-    )
-
-
-# ---------------------------------------------------------------------- slow checks
-#
-# Slow checks of a project: its MuJoCo models, and imports of its plugins.
-#
-# A run finds these out by itself, a moment later.
+# Slow checks follow: MuJoCo models, and imports of plugins. Each run makes them when it starts.
 
 
 def model_problems(project: Project) -> list[Problem]:
-    """What is wrong with MuJoCo models, and with sensors and actuators that are declared for them.
+    """Problems of MuJoCo models, and of the sensors and actuators that ports declare for them.
 
-    A model is known where the plugin names it by a literal or an environment variable of its node,
-    and MuJoCo is installed here.
+    A model is known if the plugin names it by a literal or an environment variable of its node.
+    Without MuJoCo, nothing is checked.
     """
-    nodes = [node for node in project.nodes if _has_model(node)]
-    if not nodes or find_spec("mujoco") is None:
-        return []
-    return [problem for node in nodes for problem in _model_problems(node, project.folder)]
+    problems: list[Problem] = []
+    for node in project.nodes:
+        parts = [*_parts(node.plugin)]
+        models = [(part, argument) for part in parts for argument in part.model_arguments]
+        if len(models) == 1 and find_spec("mujoco") is not None:
+            (part, argument), sets_timestep = models[0], any(p.sets_timestep for p in parts)
+            model = _model(argument, node, project.folder)
+            if isinstance(model, tuple):
+                place = display_name(part.path), argument.lineno, argument.col_offset + 1
+                problems.append(Problem(*place, "", *model))
+            elif model is not None:
+                problems += _problems_of_model(node, model, sets_timestep=sets_timestep)
+    return problems
 
 
 def import_problems(
     project: Project, messages: Messages, path: Path, overrides: Sequence[str]
 ) -> list[Problem]:
-    """Import each plugin as its node would in a process of its own; what fails, by node.
+    """Import each plugin as its node does in a process of its own; returns what fails.
 
     Args:
-        path: the project as it was named; it is loaded once more for each node.
+        path: the project as the user named it; the process of each node loads it again.
 
     Raises:
         EnvironmentFault: if the Python of a node cannot be made.
@@ -266,14 +246,13 @@ def import_problems(
     problems = []
     for node in project.nodes:
         python = pythons.paths.get(node.name, Path(sys.executable))
-        said = _import(python, node.name, path, overrides)
-        if said:
-            problems.append(Problem(f"node '{node.name}'", 0, 0, "", said))
+        if text := _import(python, node.name, path, overrides):
+            problems.append(Problem(f"node '{node.name}'", 0, 0, "", text))
     return problems
 
 
 def _import(python: Path, name: str, path: Path, overrides: Sequence[str]) -> str:
-    """What is wrong with the plugin of a node; what it prints goes to standard error."""
+    """Import the plugin of a node; returns the error. Its output goes to standard error."""
     settings = [part for text in overrides for part in ("--set", text)]
     reading, writing = os.pipe()
     command = python_command(
@@ -291,52 +270,28 @@ def _import(python: Path, name: str, path: Path, overrides: Sequence[str]) -> st
         ) as child:
             os.close(writing)
             with os.fdopen(reading, encoding="utf-8") as answer:
-                said = answer.read()
+                text = answer.read()
     code = child.returncode
     how = signal_in_words(-code) if code < 0 else f"exit code {code}"
-    return said or (f"importing the plugin ended its process: {how}" if code else "")
+    return text or (f"importing the plugin ended its process: {how}" if code else "")
 
 
-# ---------------------------------------------------------------------- models
-
-
-def _has_model(node: Node) -> bool:
-    parts = _parts(node.plugin)
-    return any(port.mujoco for port in (*node.inputs, *node.outputs)) or any(
-        part.model_arguments for part in parts
-    )
-
-
-def _model_problems(node: Node, project: Path) -> Iterator[Problem]:
-    parts = [*_parts(node.plugin)]
-    models = [(part, argument) for part in parts for argument in part.model_arguments]
-    if len(models) != 1:
-        return
-    (part, argument), sets_timestep = models[0], any(part.sets_timestep for part in parts)
-    model = _model(argument, node, project)
-    if isinstance(model, tuple):
-        place = display_name(part.path), argument.lineno, argument.col_offset + 1
-        yield Problem(*place, "", *model)
-    if model is None or isinstance(model, tuple):
-        return
+def _problems_of_model(node: Node, model: Path | str, *, sets_timestep: bool) -> Iterator[Problem]:
     from neuros.simulators.mujoco.world import problems_of
 
+    file = model if isinstance(model, Path) else node.plugin
     for pointer, text in problems_of(node, model):
-        if pointer and not (sets_timestep and pointer.endswith("/rate")):
-            yield problem_in(node.file, pointer, text)
-        elif not pointer:
-            yield from _located_in(model if isinstance(model, Path) else node.plugin, text)
-
-
-def _located_in(file: Path, text: str) -> Iterator[Problem]:
-    """What a compiler of models says, in one line or several, with the place where it names one."""
-    for row in text.splitlines():
-        if found := _PLACE.fullmatch(row):
-            yield Problem(found[1], int(found[2]), int(found[3]), "", found[4])
+        if pointer:
+            if not (sets_timestep and pointer.endswith("/rate")):
+                yield problem_in(node.file, pointer, text)
             continue
-        line = _LINE.search(row)
-        said = row.removeprefix(f"{file}: ")
-        yield Problem(display_name(file), *((int(line[1]), 1) if line else (0, 0)), "", said)
+        for row in text.splitlines():  # of a compiler of models, some with their place
+            if found := _PLACE.fullmatch(row):
+                yield Problem(found[1], int(found[2]), int(found[3]), "", found[4])
+                continue
+            line = _LINE.search(row)
+            place = (int(line[1]), 1) if line else (0, 0)
+            yield Problem(display_name(file), *place, "", row.removeprefix(f"{file}: "))
 
 
 def _parts(plugin: Path) -> Iterator[PluginFile]:
@@ -348,9 +303,9 @@ def _parts(plugin: Path) -> Iterator[PluginFile]:
 
 
 def _model(argument: ast.expr, node: Node, project: Path) -> Path | str | tuple[str, str] | None:
-    """A file with a model, or MJCF as text; a problem and its hint where that is not there.
+    """The file of a model, or MJCF as text; a problem and its hint if there is no such file.
 
-    ``None`` where it is not known.
+    ``None`` if the model is not known.
     """
     text = _text(argument, node)
     if text is None or text.lstrip().startswith("<"):
@@ -366,7 +321,7 @@ def _model(argument: ast.expr, node: Node, project: Path) -> Path | str | tuple[
 
 
 def _text(expression: ast.expr, node: Node) -> str | None:
-    """The text that an expression of a plugin stands for."""
+    """The value of an expression in a plugin, ``None`` if it is not known."""
     match expression:
         case ast.Constant(value=str(text)):
             return text

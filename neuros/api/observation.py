@@ -1,4 +1,4 @@
-"""Load monitor and provenance of a run: started with it, written into its record."""
+"""System load and provenance of a run, for its record."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HOST = "host"
 
 
 def check_observation(*, monitors_load: bool) -> None:
-    """Whether what is asked for is installed. Raises ``EnvironmentFault``."""
+    """Raise ``EnvironmentFault`` if the load is to be monitored, and psutil is not installed."""
     if monitors_load and find_spec("psutil") is None:
         raise EnvironmentFault(
             "--monitor-system-load needs the package psutil, which is missing: pip install psutil"
@@ -29,7 +29,7 @@ def check_observation(*, monitors_load: bool) -> None:
 
 
 class Observation:
-    """Watches one run, and writes what it takes of the machine where the plan asks for that."""
+    """Collects the provenance of a run, and monitors the system load if the plan asks for it."""
 
     def __init__(self, plan: Plan, run_id: str, run_folder: Path) -> None:
         from neuros.recording.provenance import GitState
@@ -47,7 +47,7 @@ class Observation:
             self._monitor.start()
 
     def finish(self) -> tuple[dict[str, Any], list[str]]:
-        """End it; returns what belongs into the run's record, and what has gone wrong."""
+        """Stop; returns entries of ``run.json``, and a sentence for each failure."""
         from neuros.recording.provenance import provenance
 
         record = {
@@ -65,11 +65,11 @@ class Observation:
 def load_monitor(
     run_id: str, run_folder: Path, names: Sequence[str], *, is_one_process: bool
 ) -> LoadMonitor:
-    """What writes the system load of a run of this machine.
+    """The monitor that writes the system load of a run.
 
     Args:
-        names: the nodes that are started.
-        is_one_process: whether they share a process, so that no figure is one node's alone.
+        names: nodes of the run.
+        is_one_process: whether they share a process, so that they have figures only together.
     """
     from neuros.recording.system_load import LAUNCHER, LoadMeter, LoadMonitor, LoadTable
 
@@ -82,14 +82,14 @@ def load_monitor(
 def owner_of_processes(
     run_id: str, names: Sequence[str], *, is_one_process: bool
 ) -> Callable[[Mapping[str, str]], str | None]:
-    """What tells whose a process of a run is, by the environment that it was started with."""
+    """A function from the environment of a process to its node, ``None``: not of this run."""
 
     def owner(environment: Mapping[str, str]) -> str | None:
         if environment.get(RUN_ID) != run_id:
             return None
-        if is_one_process:  # its threads belong to no node in particular
+        if is_one_process:
             return HOST
-        # The node's own folder, wherever that is for a node in a container.
+        # The path differs in a container; the name of the folder does not.
         name = os.path.basename(environment.get("NEUROS_RUN_DIR", "").rstrip("/"))
         return name if name in names else None
 

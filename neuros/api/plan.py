@@ -1,4 +1,4 @@
-"""Plan of a run: project and request, checked before the start, and the environments they need."""
+"""Plan of a run: project and request, checked before the start, and their environments."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ from neuros.transport.dds_profile import (
 
 _HOST_NAME = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(\.[A-Za-z0-9_-]{1,63})*\.?")  # RFC 1123
 _ON_MACHINES = "process"
-"""The back end of nodes on other machines, and of all nodes of a deployment."""
-_LISTS = 5  # of packets for each connection, at both ends: see neuros.node.logs
+"""The back end of all nodes of a deployment."""
+_LISTS = 5  # lists of packets for each connection, at both ends: see neuros.node.logs
 _LOOKS_LIKE_AN_ADDRESS = re.compile(r"[\d.]+")
 
 
 @dataclass(frozen=True)
 class Network:
-    """How far nodes look for others.
+    """Where nodes search for other nodes.
 
     Attributes:
-        is_wide: whether beyond this machine.
+        is_wide: whether on other machines, too.
         peers: IPv4 addresses of machines that multicast does not reach.
     """
 
@@ -55,7 +55,7 @@ class Network:
     peers: tuple[str, ...] = ()
 
     def environment(self, environ: Mapping[str, str]) -> dict[str, str]:
-        """What the nodes get; without a wish, what the launcher's own environment says."""
+        """The variables of nodes; ``environ`` is that of the launcher."""
         if not self.is_wide:
             return {RANGE_VARIABLE: as_asked(environ).get(RANGE_VARIABLE) or "LOCALHOST"}
         peers = {PEERS_VARIABLE: ";".join(self.peers)} if self.peers else {}
@@ -66,7 +66,7 @@ THIS_MACHINE = Network()
 
 
 def chosen_network(network: bool, peers: str | None) -> Network:
-    """What the options say.
+    """The network that the options ask for.
 
     Raises:
         UsageError: if a peer is neither an IPv4 address nor a host name.
@@ -74,14 +74,24 @@ def chosen_network(network: bool, peers: str | None) -> Network:
     """
     if peers is None:
         return Network(network)
-    return Network(True, tuple(dict.fromkeys(map(_address, named_peers(peers)))))
+    addresses: dict[str, None] = {}
+    for host in named_peers(peers):
+        try:  # here, since the container of a node may not know the name
+            found = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
+        except OSError as error:
+            raise EnvironmentFault(
+                f"--peers: the host '{host}' cannot be found from here ({error.strerror}): give its"
+                " IPv4 address"
+            ) from error
+        addresses[str(found[0][4][0])] = None
+    return Network(True, tuple(addresses))
 
 
 def named_peers(peers: str) -> list[str]:
     """The addresses and names in a text of ``--peers``.
 
     Raises:
-        UsageError: if one can be neither.
+        UsageError: if one is neither an IPv4 address nor the name of a host.
     """
     wanted = [part.strip() for part in peers.split(",")]
     nonsense = [part for part in wanted if not _is_possible(part)]
@@ -94,6 +104,7 @@ def named_peers(peers: str) -> list[str]:
 
 
 def _is_possible(text: str) -> bool:
+    """Whether a text is an address of a machine, or the name of a host."""
     if _LOOKS_LIKE_AN_ADDRESS.fullmatch(text):
         try:
             address = ipaddress.IPv4Address(text)
@@ -103,24 +114,12 @@ def _is_possible(text: str) -> bool:
     return _HOST_NAME.fullmatch(text) is not None
 
 
-def _address(host: str) -> str:
-    """The IPv4 address of a host: found here, since a node's container may not know the name."""
-    try:
-        found = socket.getaddrinfo(host, None, socket.AF_INET, socket.SOCK_DGRAM)
-    except OSError as error:
-        raise EnvironmentFault(
-            f"--peers: the host '{host}' cannot be found from here ({error.strerror}): give its"
-            " IPv4 address"
-        ) from error
-    return str(found[0][4][0])
-
-
 @dataclass(frozen=True)
 class Plan:
-    """A project, which of its nodes to start, where, and how.
+    """A project, and which of its nodes to start, where, and how.
 
     Attributes:
-        is_held: for a session.
+        is_held: whether a session steps the run.
     """
 
     project: Project
@@ -134,58 +133,58 @@ class Plan:
 
     @property
     def elsewhere(self) -> tuple[str, ...]:
-        """The nodes that are left out: they may be running elsewhere."""
+        """The nodes that are not started: they may run elsewhere."""
         return tuple(node.name for node in self.project.nodes if node.name not in self.names)
 
     @property
     def nodes(self) -> list[Node]:
-        """The nodes that are to be started."""
+        """The nodes to start."""
         return [self.project.node(name) for name in self.names]
 
     @property
     def back_end(self) -> BackEnd:
-        """Where they run."""
+        """Where the nodes run."""
         return self.chosen.back_end
 
     @property
     def deployment(self) -> Deployment:
-        """The back end made ready for them."""
+        """The back end, prepared for these nodes."""
         return self.chosen.deployment
 
     @property
     def places(self) -> Mapping[str, str]:
-        """The machine of each node that does not run on this one."""
+        """By node, its machine, if it is another one."""
         return self.deployment.places
 
     @property
     def notices(self) -> list[Notice]:
-        """What the user should know of the choice."""
+        """Notices for the user about the choice of the back end."""
         return [*self.chosen.notices, *self.deployment.notices]
 
     @property
     def nodes_here(self) -> list[Node]:
-        """The nodes that are to be started on this machine."""
+        """The nodes to start on this machine."""
         return [node for node in self.nodes if node.name not in self.places]
 
     @property
     def is_partial(self) -> bool:
-        """Whether there are such nodes."""
+        """Whether some nodes are not started."""
         return bool(self.elsewhere)
 
     @property
     def needs_known_domain(self) -> bool:
-        """Whether others have to find this run, so that it cannot hide in a domain of its own."""
+        """Whether other programs have to find the run, so that it cannot use any free domain."""
         nodes = self.project.nodes
         ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
         topics = (port.external_topic for port in ports)
         has_external_topics = any(t is not None and not t.startswith(SESSION) for t in topics)
-        is_named = bool(self.project.names.namespace)  # who wants one is among others
-        # A launcher tells the domain to all machines of its deployment.
+        is_named = bool(self.project.names.namespace)  # a namespace separates runs in one domain
+        # The machines of a deployment get the domain from this launcher.
         is_open = self.is_partial or (self.network.is_wide and not self.places)
         return is_open or has_external_topics or is_named
 
     def node_files(self, folders: Folders) -> list[NodeFile]:
-        """One ``node.json`` per node that is to be started."""
+        """The content of ``node.json`` of each node to start."""
         files = split(self.project, lambda _: folders)
         paths = self.messages.paths if self.messages else ()
         lists = _LISTS * max(1, len(self.project.connections))
@@ -197,7 +196,7 @@ class Plan:
         ]
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
-        """The launcher of the back end; ``reaper`` hears of all it starts."""
+        """The launcher of the back end; it reports its processes to ``reaper``."""
         options = ["--transport", self.back_end.transport]
         if self.back_end.is_one_process:
             options.append("--one-process")
@@ -205,7 +204,7 @@ class Plan:
             options += ["--duration-sim", repr(self.request.end.sim_s)]
         if self.request.verbose:
             options.append("--debug")
-        if self.request.digests and self.back_end.is_one_process:  # elsewhere always kept
+        if self.request.digests and self.back_end.is_one_process:  # others always keep them
             options.append("--digests")
         if self.request.recording is not None:
             options.append("--record")
@@ -226,18 +225,26 @@ class Plan:
 def make_plan(
     project: Project, messages: Messages, request: Request, *, is_tried: bool = True
 ) -> Plan:
-    """Put together what is asked for; with a deployment, reach its machines and prepare them.
+    """Plan a run; with a deployment, reach its machines and prepare them.
 
     Args:
         messages: the message packages of the project.
-        is_tried: whether it is to run, or only to be described.
+        is_tried: whether the plan is to run; else it is only described, and machines are not asked.
 
     Raises:
-        UsageError, ProjectError, EnvironmentFault: if that cannot be run.
+        UsageError, ProjectError, EnvironmentFault: if the request cannot be run.
     """
-    _check_folder(project.folder)
+    try:
+        str(project.folder).encode()  # a plugin that logs gives ROS the path of its file
+    except UnicodeEncodeError:
+        text = f"{project.folder}: the name is not UTF-8, as ROS needs it: rename it"
+        raise UsageError(text) from None
     network = chosen_network(request.network, request.peers)
-    names = _chosen_names(project, request.nodes)
+    known = [node.name for node in project.nodes]
+    for name in request.nodes:
+        if name not in known:
+            raise UsageError(f"-n {name}: no such node; the project has {', '.join(known)}")
+    names = tuple(name for name in known if not request.nodes or name in request.nodes)
     nodes = [project.node(name) for name in names]
     if request.deployment is None:
         chosen = choose(request.backend or AUTO, project, nodes, request.backend_options or {})
@@ -263,13 +270,13 @@ def make_plan(
         raise ProjectError(problems)
     if is_tried:
         check_machine(plan, os.environ)
-        peers = (*network.peers, *plan.deployment.connect(_say))
+        peers = (*network.peers, *plan.deployment.connect(_print_notice))
         plan = replace(plan, network=replace(network, peers=peers))
     return plan
 
 
 def _choose_machines(project: Project, file: Path, request: Request) -> Chosen:
-    """A deployment says itself where nodes run, and how these reach each other."""
+    """Prepare a deployment: its file tells where nodes run, and how they reach each other."""
     others = {
         "-n": request.nodes,
         "--network": request.network,
@@ -292,34 +299,38 @@ def _choose_machines(project: Project, file: Path, request: Request) -> Chosen:
     return Chosen(BACK_ENDS.load(_ON_MACHINES), deployment)
 
 
-def _say(severity: str, text: str) -> None:
-    """What is going on on other machines, before there is a console."""
+def _print_notice(severity: str, text: str) -> None:
+    """Print news from other machines, before there is a console."""
     mark = "" if severity == "INFO" else "warning: "
     print(f"neuros: {mark}{printable(text)}", file=sys.stderr, flush=True)
-
-
-def _check_folder(folder: Path) -> None:
-    """Refuse a name that is no text: a plugin that logs gives ROS the path of its file."""
-    try:
-        str(folder).encode()
-    except UnicodeEncodeError:
-        raise UsageError(f"{folder}: the name is not UTF-8, as ROS needs it: rename it") from None
 
 
 def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
     """Check that this machine can run the plan.
 
     Raises:
-        EnvironmentFault: if ROS is missing, or cannot join so many processes, or a node asks for
-            a core that is not there, or one Python has to do and does not.
+        EnvironmentFault: if ROS is missing, or cannot connect so many processes, or a node asks
+            for a core that is missing, or nodes of one process need several Pythons.
     """
     if find_spec("rclpy") is None:
         raise EnvironmentFault(
             f"rclpy, the Python library of ROS 2, is not installed for {sys.executable}:"
             f" {install_command()}"
         )
-    if plan.request.placement:
-        _check_cores(plan)
+    usable = usable_cores()
+    # A project may have been written for another machine: its cores are no mistake in it.
+    problems = [
+        f"{problem_in(node.file, f'{node.pointer}/affinity', text)}"
+        for node in plan.nodes_here
+        if plan.request.placement and (missing := set(node.affinity) - usable)
+        for text in [f"node '{node.name}' asks for {_cores_in_words(missing)}"]
+    ]
+    if problems:
+        problems.append(
+            f"NeuROS may use {_cores_in_words(usable)} here: choose others with --set"
+            " nodes.NAME.affinity=[...], or leave it to the kernel with --no-placement"
+        )
+        raise EnvironmentFault("\n".join(problems))
     is_one_process = plan.back_end.is_one_process
     if is_one_process:
         require_one_python(plan.nodes, plan.project.folder, environ)
@@ -331,42 +342,12 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
         )
 
 
-def _check_cores(plan: Plan) -> None:
-    """A project may have been written for another machine: its cores are no mistake in it."""
-    usable = usable_cores()
-    problems = [
-        str(
-            problem_in(
-                node.file,
-                f"{node.pointer}/affinity",
-                f"node '{node.name}' asks for {_cores_in_words(missing)}",
-            )
-        )
-        for node in plan.nodes_here
-        if (missing := set(node.affinity) - usable)
-    ]
-    if problems:
-        problems.append(
-            f"NeuROS may use {_cores_in_words(usable)} here: choose others with --set"
-            " nodes.NAME.affinity=[...], or leave it to the kernel with --no-placement"
-        )
-        raise EnvironmentFault("\n".join(problems))
-
-
 def _cores_in_words(cores: Collection[int]) -> str:
     return f"core{'s' if len(cores) > 1 else ''} {', '.join(map(str, sorted(cores)))}"
 
 
-def _chosen_names(project: Project, wanted: Sequence[str]) -> tuple[str, ...]:
-    known = [node.name for node in project.nodes]
-    for name in wanted:
-        if name not in known:
-            raise UsageError(f"-n {name}: no such node; the project has {', '.join(known)}")
-    return tuple(name for name in known if not wanted or name in wanted)
-
-
 def _check_reach(project: Project, chosen: Collection[str], back_end: BackEnd) -> None:
-    """Nodes that hand packets over in memory reach none elsewhere."""
+    """Refuse a connection to a node elsewhere: these nodes pass packets in memory."""
     for connection in project.connections:
         ends = {connection.source_node, connection.destination_node}
         if len(ends) == 2 and len(ends.intersection(chosen)) == 1:
@@ -377,27 +358,27 @@ def _check_reach(project: Project, chosen: Collection[str], back_end: BackEnd) -
 
 
 def _check_isolation(plan: Plan) -> None:
-    """A run in a network of its own reaches nothing outside."""
+    """Refuse what a run in a network of its own cannot reach."""
     if plan.network.is_wide or plan.is_partial:
         option = "--network" if plan.network.is_wide else "-n"
         raise UsageError(f"--isolate with {option}: nodes elsewhere cannot reach the run")
     nodes = plan.project.nodes
     sent = {port.external_topic for node in nodes for port in node.outputs}
-    heard = [
+    unreachable = [
         f"{node.name}.{port.name} ({port.external_topic})"
         for node in nodes
         for port in node.inputs
         if port.external_topic not in sent | {None}
     ]
-    if heard:
+    if unreachable:
         raise UsageError(
-            f"--isolate: other programs cannot reach the external inputs {', '.join(heard)}; leave"
-            " --isolate out, or connect them"
+            f"--isolate: other programs cannot reach the external inputs"
+            f" {', '.join(unreachable)}; leave --isolate out, or connect them"
         )
 
 
 def time_problems(project: Project, nodes: Sequence[Node], end: Duration) -> Sequence[Problem]:
-    """What is wrong if these nodes are to end in simulated time."""
+    """The problem of a duration in simulated time, unless exactly one node owns time."""
     if end.sim_s is None:
         return ()
     owners = [node.name for node in nodes if node.owns_time]
@@ -417,17 +398,20 @@ def time_problems(project: Project, nodes: Sequence[Node], end: Duration) -> Seq
 
 
 def make_environments(pythons: Pythons, messages: Messages | None, output: Stream) -> None:
-    """Make what is missing, and say so; ``KeyboardInterrupt`` ends it at any time.
+    """Make missing environments and message packages; ``KeyboardInterrupt`` ends it at any time.
+
+    Args:
+        output: shows the progress.
 
     Raises:
-        EnvironmentFault: with all that failed.
+        EnvironmentFault: with all failures.
     """
     pythons.note_use()
     if messages is not None:
         messages.note_use()
     if are_made(pythons, messages):
         return
-    # pip, the compiler, and what they start must not outlive a launcher that is killed.
+    # The reaper ends pip, the compiler, and their children when the launcher is killed.
     run_id = os.urandom(8).hex()
     reaper = Reaper.start(run_id)
     try:

@@ -71,29 +71,29 @@ class Project:
 
     Attributes:
         file: the project file.
-        settings: values in the place of those in the files, by path.
+        settings: by path, values that replace those in the files.
     """
 
     def __init__(self, file: Path, settings: Mapping[str, Any]) -> None:
         self.settings = dict(settings)
         self._path = file
         self._loaded = self._load()
-        self._said = {*self._loaded.warnings}
+        self._warned = {*self._loaded.warnings}
         self.file = self._loaded.project.file
 
     @classmethod
     def from_file(
         cls, path: str | os.PathLike[str], *, set: Mapping[str, Any] | None = None
     ) -> Project:
-        """Load and check a project. What may be a mistake in it is a Python warning.
+        """Load and check a project; possible mistakes are Python warnings.
 
         Args:
             path: the project file, or a folder that holds ``project.json``.
-            set: values in the place of those in the files, as ``--set`` has them:
+            set: values that replace those in the files, as with ``--set``:
                 ``{"nodes.robot.environment.RATE": 0.5}``; ``None`` removes the key.
 
         Raises:
-            ProjectError: with every problem there is.
+            ProjectError: with all problems.
         """
         project = cls(Path(path).absolute(), set or {})
         for warning in project._loaded.warnings:
@@ -102,38 +102,38 @@ class Project:
 
     @property
     def name(self) -> str:
-        """Its name."""
+        """The name of the project."""
         return self._loaded.project.name
 
     @property
     def description(self) -> str:
-        """What its file says of it."""
+        """The description in the project file."""
         return self._loaded.project.description
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """The names of its nodes."""
+        """The names of the nodes."""
         return tuple(node.name for node in self._loaded.project.nodes)
 
     @property
     def connections(self) -> tuple[str, ...]:
-        """Its connections: ``a.out -> b.in``."""
+        """The connections: ``a.out -> b.in``."""
         return tuple(map(str, self._loaded.project.connections))
 
     def with_settings(self, settings: Mapping[str, Any]) -> Project:
-        """The same project with further values in the place of those in the files.
+        """The same project with further values that replace those in the files.
 
         Raises:
-            ProjectError: if it is not valid with them.
+            ProjectError: if the project is not valid with these values.
         """
         return Project(self._path, {**self.settings, **settings})
 
     def check_with(self, settings: Mapping[str, Any], seed: int | None = None) -> Described:
-        """Check it as it would be run with these values, and do no more; returns its model.
+        """Check the project as a run with these values does; returns its model.
 
         Raises:
-            ProjectError: with every problem there is.
-            UsageError: if there is a seed, and no node takes one.
+            ProjectError: with all problems.
+            UsageError: if there is a seed, and no node has a variable for it.
         """
         return self._load_for_run(StartOptions(set=settings, seed=seed))[0]
 
@@ -142,10 +142,10 @@ class Project:
         return json.dumps(project_to_json(self._loaded.project), sort_keys=True)
 
     def validate(self) -> tuple[Problem, ...]:
-        """Read the files again and check them; returns what may be a mistake all the same.
+        """Read the files again and check them; returns possible mistakes.
 
         Raises:
-            ProjectError: with every problem there is.
+            ProjectError: with all problems.
         """
         self._loaded, messages = load_with_messages(self._path, override_texts(self.settings))
         project = self._loaded.project
@@ -162,13 +162,13 @@ class Project:
 
     @takes(RunOptions)
     def run(self, options: RunOptions) -> Run:
-        """Run it to its end; works in a notebook, in any thread, and several times at once.
+        """Run the project to its end; works in notebooks, threads, and several times at once.
 
-        The files are read again. ``KeyboardInterrupt`` ends the run in order and then goes on.
+        The files are read again. ``KeyboardInterrupt`` ends the run in order and is raised then.
 
         Raises:
-            ProjectError: if it is not valid, or not with ``set``.
-            UsageError: for arguments that make no sense.
+            ProjectError: if the project is not valid, or not with ``set``.
+            UsageError: for wrong arguments.
             EnvironmentFault: if something is missing on this machine.
             RunError: if ``check`` is set and the run did not end normally.
         """
@@ -183,20 +183,20 @@ class Project:
 
     @takes(StartOptions)
     def start(self, options: StartOptions) -> LiveRun:
-        """Start it and go on: the errors of :meth:`run`."""
+        """Start a run in the background; raises as :meth:`run`."""
         live = self._prepared(options)
         live.begin()
         return live
 
     @takes(SessionOptions)
     def session(self, options: SessionOptions) -> Session:
-        """Start it, and hold it before the first hook: the program steps it, reads and sends.
+        """Start a run that this program steps, and whose packets it reads and sends.
 
-        Initialise hooks have run when this returns.
+        When this returns, initialise hooks have run, and no other hook.
 
         Raises:
             ProjectError, UsageError, EnvironmentFault: as :meth:`run` does.
-            RunError: if it has ended meanwhile.
+            RunError: if the run has ended already.
         """
         from neuros.api.session import Session  # brings rclpy
         from neuros.api.session_link import Held, with_session_inputs
@@ -206,7 +206,9 @@ class Project:
         count = itertools.count(1)
 
         def start(seed: int | None) -> Held:
-            output = _numbered(options.output, next(count))
+            number, output = next(count), None
+            if options.output is not None:  # out, out-2, out-3
+                output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
             own = replace(options, seed=seed, output=output)
             project, messages = self._load_for_run(own)
             held, inputs = with_session_inputs(project, options.take_over)
@@ -217,7 +219,7 @@ class Project:
         return Session(start, options.seed)
 
     def __reduce__(self) -> tuple[type[Project], tuple[Path, dict[str, Any]]]:
-        """As another machine, or a later time, has it: read again."""
+        """Pickle the path: the files are read again."""
         return Project, (self._path, self.settings)
 
     def __repr__(self) -> str:
@@ -225,7 +227,7 @@ class Project:
         return f"<Project {self.name}: {counts}; {self.file}>"
 
     def _prepared(self, options: StartOptions) -> LiveRun:
-        """A run that has yet to begin."""
+        """A run that has not begun."""
         return self._live(*self._load_for_run(options), options)
 
     def _live(
@@ -264,24 +266,24 @@ class Project:
             ]
             loaded, messages = load_with_messages(self._path, texts, *names)
         for warning in loaded.warnings:
-            if warning not in self._said:
-                self._said.add(warning)
+            if warning not in self._warned:
+                self._warned.add(warning)
                 warnings.warn(str(warning), stacklevel=3)
         return loaded.project, messages
 
 
 def override_texts(settings: Mapping[str, Any] | Sequence[str] | None) -> tuple[str, ...]:
-    """As the texts of ``--set``: ``{"nodes.a.environment.RATE": 0.5}``. ``None`` removes a key."""
+    """Settings as texts of ``--set``: ``["nodes.a.environment.RATE=0.5"]``."""
     if not isinstance(settings, Mapping):
         return tuple(settings or ())
     return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
 
 
 def value_text(path: str, value: Any) -> str:
-    """A value as ``--set`` has it; in ``environment`` all is text.
+    """A value as text for ``--set``; ``None``, which removes the key, is empty.
 
     Raises:
-        UsageError: if it is nothing that JSON knows.
+        UsageError: if JSON has no such value.
     """
     if value is None:
         return ""
@@ -291,8 +293,3 @@ def value_text(path: str, value: Any) -> str:
         return json.dumps(value.tolist() if hasattr(value, "tolist") else value)
     except (TypeError, ValueError) as error:
         raise UsageError(f"{path}: {error}") from error
-
-
-def _numbered(output: str | os.PathLike[str] | None, number: int) -> str | None:
-    """The run folder of a run of a session: ``out``, ``out-2``, ``out-3``."""
-    return None if output is None else os.fspath(output) + (f"-{number}" if number > 1 else "")

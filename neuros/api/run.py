@@ -23,17 +23,17 @@ _SUMMED = ("executing", "waiting", "blocked")
 
 
 class Run(PastRun):
-    """What a run has left behind: how it ended, its figures, its packets, its logs.
+    """Result of a run: its end, its figures, its packets, its logs.
 
     Attributes:
         folder: the run folder.
-        record: the content of ``run.json``, which has all that is here and more.
+        record: the content of ``run.json``, which has all figures.
 
     Args:
         folder: of a run that has ended.
 
     Raises:
-        UsageError: if it is none, or another version of NeuROS wrote it.
+        UsageError: if the folder has no run, or one of another version of NeuROS.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -52,19 +52,19 @@ class Run(PastRun):
 
     @property
     def exit_code(self) -> int:
-        """0 ended normally, 1 a node failed or was killed, a deadlock or a lossless connection
-        that was none, 4 a record was not written, 5 a budget was broken, 130 Ctrl+C, 143 SIGTERM.
+        """0 normal end; 1 a node failed or was killed, a deadlock, or loss on a lossless
+        connection; 4 a record was not written; 5 a budget was broken; 130 Ctrl+C; 143 SIGTERM.
         """
         return int(self.record["exit_code"])
 
     @property
     def reason(self) -> str:
-        """How it ended, in one line."""
+        """Why the run ended, in one line."""
         return str(self.record["reason"])
 
     @property
     def is_ok(self) -> bool:
-        """Whether it ended normally."""
+        """Whether the run ended normally."""
         return self.exit_code == 0
 
     @property
@@ -74,7 +74,7 @@ class Run(PastRun):
 
     @property
     def sim_s(self) -> float | None:
-        """Simulated time in seconds, ``None`` where no node owns time."""
+        """Simulated time in seconds, ``None`` if no node owns time."""
         return _number(self.record["sim_s"])
 
     @property
@@ -84,22 +84,22 @@ class Run(PastRun):
 
     @property
     def node_results(self) -> dict[str, Mapping[str, Any]]:
-        """What plugins have found out (``node.set_result``), by node and name."""
+        """Results of plugins (``node.set_result``), by node and name."""
         return {name: node.get("results", {}) for name, node in self.nodes.items()}
 
     def connection_frame(self) -> Any:
-        """A ``pandas.DataFrame`` of the connections, a row each; of an extension."""
+        """A ``pandas.DataFrame`` with a row for each connection; made by an extension."""
         rows = map(connection_figures, self.record["connections"])
         return BAG_FORMATS.load("table")(rows, "connection")
 
     def node_frame(self) -> Any:
-        """A ``pandas.DataFrame`` of the nodes: seconds by cause; of an extension."""
+        """A ``pandas.DataFrame`` of seconds by cause, a row for each node; made by an extension."""
         rows = (node_figures(name, node) for name, node in self.nodes.items())
         return BAG_FORMATS.load("table")(rows, "node")
 
     @cached_property
     def bag(self) -> Bag:
-        """The packets of a run that was recorded, as :func:`neuros.bag.open` has them.
+        """The recorded packets, as :func:`neuros.bag.open` returns them.
 
         Raises:
             UsageError: if nothing was recorded.
@@ -110,10 +110,10 @@ class Run(PastRun):
         return open_bag(self.folder)
 
     def log(self, node: str) -> str:
-        """All that a node has logged and printed, empty if it did not.
+        """The log and output of a node.
 
         Raises:
-            KeyError: if there was no such node.
+            KeyError: if the run has no such node.
         """
         if node not in self.nodes:
             raise KeyError(f"{node}: there are {', '.join(self.nodes)}")
@@ -121,10 +121,10 @@ class Run(PastRun):
         return read_bytes(file).decode("utf-8", "replace") if file.exists() else ""
 
     def check(self) -> Run:
-        """This run, if it ended normally.
+        """Return this run.
 
         Raises:
-            RunError: if it did not.
+            RunError: if the run did not end normally.
         """
         if not self.is_ok:
             broken = self.record.get("broken_budgets") or []
@@ -144,7 +144,7 @@ class Run(PastRun):
 
 
 def connection_figures(connection: Mapping[str, Any]) -> dict[str, Any]:
-    """A connection in one row: of its latency each figure, without its digests."""
+    """A connection in one row: its figures with those of its latency, without digests."""
     latency = connection.get("latency_ms") or {}
     plain = {k: v for k, v in connection.items() if k not in ("latency_ms", "digests", "index")}
     return plain | {f"latency_{name}_ms": latency.get(name) for name in _LATENCIES}

@@ -4,11 +4,11 @@
 
     runs/<project>/<utc time>/     or exactly what -o names
         project.json               the expanded project
-        run.json                   how the run went
+        run.json                   the record of the run
         launcher.log               stacks that are too long for the console
-        <node>/node.json           what the node was told
-        <node>/node.log            what it printed and logged
-        <node>/...                 what its plugin wrote to node.run_dir
+        <node>/node.json           project, connections and settings of the node
+        <node>/node.log            its output and log
+        <node>/...                 files that its plugin wrote to node.run_dir
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ LAUNCHER_LOG = "launcher.log"
 def run_folder_path(
     output: str | os.PathLike[str] | None, project_name: str, time: str | None = None
 ) -> Path:
-    """Where a run goes: ``output``, else a folder of the project and ``time`` (now, in UTC)."""
+    """The folder of a run: ``output``, else one named after project and ``time`` (now, in UTC)."""
     if output is not None:
         return Path(output).absolute()
     stamp = time or datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%S.%fZ")
@@ -52,11 +52,12 @@ def make_run_folder(output: str | os.PathLike[str] | None, project_name: str) ->
     """Create the folder of a run, which only its user can read.
 
     Raises:
-        UsageError: if it exists and is not empty, or cannot be created.
+        UsageError: if the folder is not empty, or cannot be created.
     """
     folder = run_folder_path(output, project_name)
     try:
-        if output is not None and _is_taken(folder):
+        is_used = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+        if output is not None and is_used:
             raise UsageError(f"-o {os.fspath(output)}: is not an empty folder; name a new one")
         folder.mkdir(0o700, parents=True, exist_ok=output is not None)
     except OSError as error:
@@ -66,22 +67,21 @@ def make_run_folder(output: str | os.PathLike[str] | None, project_name: str) ->
     return folder
 
 
-def _is_taken(folder: Path) -> bool:
-    return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
-
-
 def folders_of(plan: Plan, run_folder: Path) -> Folders:
-    """What the nodes may read and write."""
+    """The folders that nodes may read or write."""
     return Folders(plan.project.folder, WORKSPACE, run_folder)
 
 
 def removed_folders(files: Sequence[NodeFile], run_folder: Path) -> list[str]:
-    """A sentence for each folder of a run that was removed, or moved, since its nodes have begun.
-
-    What nodes write later makes folders again, so their files tell it.
-    """
-    names = [file.node.name for file in files]
-    gone = [name for name in names if _is_gone(run_folder / name / "node.json")]
+    """A sentence for each folder of a run that was removed or moved while the run went on."""
+    names, gone = [file.node.name for file in files], []
+    for name in names:
+        try:  # the file, since a node that writes later makes its folder again
+            (run_folder / name / "node.json").lstat()
+        except (FileNotFoundError, NotADirectoryError):
+            gone.append(name)
+        except OSError:  # the node may have closed its folder to others
+            pass
     folders = [run_folder] if gone == names else [run_folder / name for name in gone]
     return [
         f"{folder} was removed while the run went on: what was written there before is lost"
@@ -89,32 +89,22 @@ def removed_folders(files: Sequence[NodeFile], run_folder: Path) -> list[str]:
     ]
 
 
-def _is_gone(file: Path) -> bool:
-    try:
-        file.lstat()
-    except (FileNotFoundError, NotADirectoryError):
-        return True
-    except OSError:  # a node may have shut its folder
-        return False
-    return False
-
-
 def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
     """Write the expanded project and one ``node.json`` per node.
 
     Raises:
-        UsageError: if the folder cannot be written to, or another run has just begun there.
+        UsageError: if the folder cannot be written to, or another run has begun there.
     """
     files = plan.node_files(folders_of(plan, run_folder))
     try:
-        # Two runs that were given the same empty folder: only one of them gets it.
+        # Mode x: of two runs that were given the same empty folder, only one gets it.
         with open(run_folder / "project.json", "x", encoding="utf-8") as expanded:
             expanded.write(json.dumps(project_to_json(plan.project), indent=2) + "\n")
         for file in files:
             (run_folder / file.node.name).mkdir(exist_ok=True)
             path = run_folder / file.node.name / "node.json"
             seen = plan.deployment.as_seen(file)
-            path.touch(0o600)  # wherever the folder is: it holds the environment
+            path.touch(0o600)  # it holds the environment, which others must not read
             path.write_text(node_file_text(seen), "utf-8")
     except FileExistsError as error:
         raise UsageError(
@@ -127,16 +117,11 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
     return files
 
 
-# ---------------------------------------------------------------------- recording
-#
-# The recording of a run: planned before the start, reported after the end.
-
-
 _PACKAGES = ("ros-jazzy-rclpy", "rosbags", "mujoco", "nest-simulator", "numpy")
 
 
 class Recording:
-    """What is recorded of one run, and the process that does it.
+    """The recording of one run, and its recorder process.
 
     Raises:
         UsageError: if the run folder cannot be written to.
@@ -164,35 +149,19 @@ class Recording:
         reaper.watch(self._process.pid)
 
     def finish(self, signals: Sequence[int]) -> Recorded:
-        """Have the bag completed; who has no patience for that sends another signal."""
+        """Complete the bag; a further signal ends that."""
         before = len(signals)
         return self._process.finish(lambda: len(signals) > before)
 
     def report(self, recorded: Recorded, record: dict[str, Any]) -> list[str]:
-        """Put into the record what was recorded; returns what is missing, a sentence each."""
-        topics = self._topics(recorded, record)
-        problems = list(recorded.problems)
-        if recorded.counts:  # else the recorder has stopped, and said so
-            problems += _missing(
-                {
-                    name: topic
-                    for name, topic in topics.items()
-                    if not any(text.startswith(f"{name} ") for text in recorded.problems)
-                }
-            )
-        record["recording"] = {
-            "bag": str(self._run / BAG_NAME),
-            "storage": "mcap",
-            "topics": topics,
-            "problems": problems,
+        """Add the recording to the record of the run; returns a sentence for each loss."""
+        # Packets that passed this run on a connection: sent, or received from elsewhere.
+        passed = {
+            c["connection"]: c["received"] if c["sent"] is None else c["sent"]
+            for c in record["connections"]
         }
-        return problems
-
-    def _topics(self, recorded: Recorded, record: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-        """Per topic the packets in the bag, and those that passed this run."""
-        passed = {c["connection"]: _passed(c) for c in record["connections"]}
         planned = {topic.name: topic for topic in self._plan.topics}
-        topics = {}
+        topics: dict[str, dict[str, Any]] = {}
         for name in dict.fromkeys([*planned, *recorded.counts]):
             topic = planned.get(name)
             connection = None if topic is None else topic.connection
@@ -202,14 +171,30 @@ class Recording:
                 "passed": None if connection is None else passed.get(connection),
                 "is_lossy": bool(connection and topic and not topic.is_reliable),
             }
-        return topics
+        problems = list(recorded.problems)
+        if recorded.counts:  # without counts the recorder has stopped, which is a problem already
+            problems += [
+                f"{topic['passed'] - topic['recorded']} of {topic['passed']} packets of {name} are"
+                " not in the bag"
+                for name, topic in topics.items()
+                if topic["passed"] is not None
+                and topic["recorded"] < topic["passed"]
+                and not any(text.startswith(f"{name} ") for text in recorded.problems)
+            ]
+        record["recording"] = {
+            "bag": str(self._run / BAG_NAME),
+            "storage": "mcap",
+            "topics": topics,
+            "problems": problems,
+        }
+        return problems
 
 
 def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None:
-    """What is recorded of a run, ``None``: nothing.
+    """The plan of the recording that a run asks for, ``None``: nothing is recorded.
 
     Raises:
-        UsageError: if something is to be recorded that is not there.
+        UsageError: for a topic that does not exist.
     """
     wanted = plan.request.recording
     if wanted is None:
@@ -225,12 +210,12 @@ def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None
 
 
 def log_of(run: Path) -> Path:
-    """Where the recorder writes what it has to say."""
+    """The log of the recorder."""
     return run / "recorder.log"
 
 
 def summary(report: Mapping[str, Any]) -> str:
-    """One or two lines for the end of a run."""
+    """The recording in one or two lines, for the end of a run."""
     topics = report["topics"].values()
     count = sum(topic["recorded"] for topic in topics)
     noun = "topic" if len(topics) == 1 else "topics"
@@ -245,25 +230,8 @@ def summary(report: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _missing(topics: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """What has passed this run and is not in the bag, a sentence each."""
-    return [
-        f"{topic['passed'] - topic['recorded']} of {topic['passed']} packets of {name} are not in"
-        " the bag"
-        for name, topic in topics.items()
-        if topic["passed"] is not None and topic["recorded"] < topic["passed"]
-    ]
-
-
-def _passed(connection: Mapping[str, Any]) -> int | None:
-    """The packets that passed this run on a connection: sent, or received from elsewhere."""
-    sent = connection["sent"]
-    found: int | None = connection["received"] if sent is None else sent
-    return found
-
-
 def _custom_data(project: Project) -> dict[str, str]:
-    """What the metadata of the bag says about the run; each value is text."""
+    """Data about the run for the metadata of the bag; each value is text."""
     content = json.dumps(project_to_json(project), sort_keys=True)
     versions = {"neuros": __version__, "python": platform.python_version()}
     for package in _PACKAGES:

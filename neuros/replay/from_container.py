@@ -18,12 +18,12 @@ _INSTALLERS = {"pip", "setuptools", "wheel"}  # nothing that a node computes dep
 
 
 def ran_in_container(run: PastRun) -> bool:
-    """Whether the nodes of a run had Pythons of their own, as those of containers."""
+    """Whether the nodes of a run had Pythons of their own, as in containers."""
     return _back_end(run).has_own_pythons
 
 
 def as_on_this_machine(run: PastRun, file: NodeFile, workspace: Path, messages: Path) -> NodeFile:
-    """The node with the paths of this machine; ``file`` has those that it saw in its run.
+    """``node.json`` with the paths of this machine; ``file`` has the paths of the run.
 
     Args:
         messages: the folder with built message packages.
@@ -38,7 +38,7 @@ def _back_end(run: PastRun) -> BackEnd:
 
 
 def not_here(run: PastRun, name: str, cause: object) -> EnvironmentFault:
-    """The error for something that a node had where it ran and this machine lacks."""
+    """The error for a module or file that the node had in its run, and this machine lacks."""
     return EnvironmentFault(
         f"replay: in {run.folder} '{name}' ran in {_back_end(run).place}; a replay runs as a"
         f" process of this machine, which lacks something: {cause}"
@@ -63,7 +63,7 @@ def note_on_versions(run: PastRun, name: str, here: Mapping[str, Any]) -> str:
         here: as from :func:`neuros.recording.provenance.python_versions`.
     """
     versions = run.record["versions"]
-    there = versions["nodes"].get(name, versions)  # not noted where it is the launcher's own
+    there = versions["nodes"].get(name, versions)  # not recorded if they are those of the launcher
     had = {"Python": there["python"], **there["packages"]}
     has = {"Python": here["python"], **here["packages"]}
     rows = [

@@ -1,4 +1,4 @@
-"""Packets of one node in a recorded run: received and sent."""
+"""Packets that one node of a recorded run has received and sent."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _RECORD = "run the project again with -r (--record), and replay that run"
 
 
 def recorded_node(run_folder: Path, name: str) -> tuple[PastRun, NodeFile]:
-    """A run, and what one of its nodes was told: in a container, with the paths of that.
+    """A run, and ``node.json`` of one of its nodes, with the paths that the node saw.
 
     Raises:
-        UsageError: if the run or the node does not exist, or was not recorded so that the node
-            can be replayed.
+        UsageError: if the run or the node does not exist, or the recording is not enough for a
+            replay.
         EnvironmentFault: if a file of the run is damaged.
     """
     run = open_run(run_folder)
@@ -52,8 +52,8 @@ class RecordedNode:
     """The packets of one node, from the bag of a run.
 
     Attributes:
-        event_log: what happened to its engine (:mod:`neuros.engine.event_log`).
-        plan: what was recorded.
+        event_log: events of its engine (:mod:`neuros.engine.event_log`).
+        plan: of the recording.
 
     Raises:
         UsageError: if the run was not recorded, or packets for the node were left out.
@@ -71,24 +71,41 @@ class RecordedNode:
         if not is_understood(self.event_log):
             raise EnvironmentFault(f"{_event_log_of(run.folder, self._name)} is damaged")
         self._arrivals: dict[Connection | str, Sequence[bytes | None]] = {}
-        self._check_inputs()
+        recorded = {name for topic in self.plan.topics for name in (topic.connection, topic.name)}
+        inputs = [
+            *(
+                str(c)
+                for c in file.connections
+                if c.destination_node == self._name != c.source_node
+            ),
+            *(self._topic(port.name) for port in file.node.inputs if port.external_topic),
+        ]
+        if missing := [name for name in inputs if name not in recorded]:
+            raise UsageError(
+                f"replay: what '{self._name}' received on {', '.join(missing)} was not recorded:"
+                f" {_RECORD}"
+            )
 
     def arrived(self, key: Connection | str, number: int) -> bytes | None:
-        """The packet that arrived as the ``number``-th (from 1) on a connection or an input's
-        external topic; ``None`` where the bag ends before it.
+        """The ``number``-th packet, from 1, that arrived; ``None`` if the bag ends before it.
+
+        Args:
+            key: the connection, or the input with an external topic.
 
         Raises:
-            UsageError: if it cannot be told which one that was.
+            UsageError: if the run does not tell which packets arrived.
         """
         if key not in self._arrivals:
-            self._arrivals[key] = self._heard(key) if isinstance(key, str) else self._received(key)
+            self._arrivals[key] = (
+                self._from_outside(key) if isinstance(key, str) else self._received(key)
+            )
         arrivals = self._arrivals[key]
         return arrivals[number - 1] if number <= len(arrivals) else None
 
     def sent(self) -> dict[tuple[Way, str], list[tuple[str, str, Sequence[Any]]]]:
-        """Packets sent: by way and port or connection, the topics with name, type and packets.
+        """Packets that the node has sent, by way and by port or connection.
 
-        A topic is called by its connection, if it belongs to one.
+        Each value is a list of topics: name (that of the connection, if any), type and packets.
         """
         found: dict[tuple[Way, str], list[tuple[str, str, Sequence[Any]]]] = {}
         for stream in self.plan.streams.get(self._name, ()):
@@ -103,7 +120,7 @@ class RecordedNode:
         return found
 
     def lacking(self) -> dict[str, tuple[int, int]]:
-        """Connections of which the bag has lost packets: how many it has, of how many."""
+        """Connections of which the bag lacks packets: how many packets it has, of how many."""
         found = {}
         for topics in self.sent().values():
             for name, _, packets in topics:
@@ -116,35 +133,18 @@ class RecordedNode:
         """A message of a type that the bag has."""
         return self._bag.message(data, type_name)
 
-    # ------------------------------------------------------------------ inside
-
     def _packets(self, topic: str) -> Sequence[Any]:
         return self._bag.topics[topic].raw() if topic in self._bag.topics else ()
-
-    def _check_inputs(self) -> None:
-        recorded = {topic.connection for topic in self.plan.topics}
-        recorded |= {topic.name for topic in self.plan.topics}
-        wanted = [
-            str(c)
-            for c in self._file.connections
-            if c.destination_node == self._name != c.source_node
-        ] + [self._topic(port.name) for port in self._file.node.inputs if port.external_topic]
-        missing = [name for name in wanted if name not in recorded]
-        if missing:
-            raise UsageError(
-                f"replay: what '{self._name}' received on {', '.join(missing)} was not recorded:"
-                f" {_RECORD}"
-            )
 
     def _received(self, connection: Connection) -> Sequence[bytes | None]:
         packets = [packet.data for packet in self._packets(f"{connection.topic}/data")]
         if connection.is_reliable or self._keeps(Way.RECEIVED, str(connection)):
             return packets
-        digests = read_packets(self._run.folder, connection)  # of a recorded run, from the first
+        digests = read_packets(self._run.folder, connection)
         places = {digest: place for place, digest in enumerate(digests.sent.tolist())}
         received = digests.received.tolist()
         figures = self._run.connections.get(str(connection), {})
-        if len(places) < (figures.get("sent") or 0):  # the list had no room for more
+        if len(places) < (figures.get("sent") or 0):  # the list was full
             received = [*takewhile(places.__contains__, received)]
         if not received or any(digest not in places for digest in received):
             raise UsageError(
@@ -154,7 +154,7 @@ class RecordedNode:
         arrived = (places[digest] for digest in received)
         return [packets[place] if place < len(packets) else None for place in arrived]
 
-    def _heard(self, name: str) -> Sequence[bytes]:
+    def _from_outside(self, name: str) -> Sequence[bytes]:
         """Only the first node that listens to an external topic records what arrives."""
         topic = self._topic(name)
         if not self._keeps(Way.HEARD, name):

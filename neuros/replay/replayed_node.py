@@ -1,6 +1,6 @@
-"""Replays one node of a recorded run: the real plugin on the real engine, with recorded packets.
+"""Replay of one node of a recorded run: the plugin on the engine, with recorded packets.
 
-At the end of the module are the debuggers that it can run under.
+The debuggers of a replay are at the end of the module.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from neuros.transport.envelope import Traffic
 from neuros.transport.messages import RosPackets
 from neuros.transport.null_middleware import HeldLoop, NullMiddleware
 
-_LOOK_S = 0.1
+_POLL_S = 0.1
 _DEBUGPY_HOST = "127.0.0.1"
 
 SIDES = ("the run", "the replay")
@@ -65,7 +65,7 @@ class Comparison:
         lacking: topics of which not all packets were recorded.
 
     Attributes:
-        difference: the first one, in a sentence; ``None`` so far.
+        difference: the first difference, in a sentence; ``None`` so far.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class Comparison:
 
     @property
     def packets(self) -> int:
-        """Packets that were compared, once for each connection."""
+        """How many packets were compared; a packet counts for each connection."""
         return sum(
             min(stream.sent, len(packets))
             for stream in self._streams
@@ -88,15 +88,15 @@ class Comparison:
 
     @property
     def connections(self) -> int:
-        """Connections, and external topics, that there are."""
+        """How many connections and external topics are compared."""
         return sum(len(stream.topics) for stream in self._streams)
 
     def stream(self, way: Way, name: str) -> int | None:
-        """The number of such packets; ``None`` if the run has not recorded them."""
+        """The number of a stream; ``None`` if the run has not recorded it."""
         return self._numbers.get((way, name))
 
     def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
-        """A packet was sent."""
+        """Compare a packet that the replay sends."""
         if self.difference is not None:
             return
         passed = self._streams[stream]
@@ -115,7 +115,7 @@ class Comparison:
                 return
 
     def find_missing(self) -> None:
-        """The node will send nothing more."""
+        """Compare the numbers of packets, at the end of the replay."""
         for stream in self._streams:
             for topic, _, packets in stream.topics:
                 if self.difference is None and stream.sent < len(packets):
@@ -130,7 +130,7 @@ class Comparison:
     def _compare(
         self, topic: str, type_name: str, number: int, recorded: bytes, data: bytes
     ) -> None:
-        """Bytes may differ where nothing but padding does."""
+        """Compare the fields of packets of different bytes, which may differ in padding only."""
         pair = self._message(recorded, type_name), self._message(data, type_name)
         field = next(differing_fields(*pair, sides=SIDES), None)
         if field is not None:
@@ -141,7 +141,7 @@ class ReplayedNode:
     """One node of a run.
 
     Attributes:
-        comparison: of the packets that it sends.
+        comparison: of its packets with those of the run.
         failure: the error that ended it, ``None`` so far.
         notes: sentences for the user.
         difference: the first difference from the run, in a sentence; ``None`` so far.
@@ -150,7 +150,7 @@ class ReplayedNode:
     def __init__(self, file: NodeFile, recorded: RecordedNode) -> None:
         self._file, self._recorded = file, recorded
         self._script = Script(recorded.event_log)
-        self._loop = HeldLoop(self._script.deliveries.append, self._note_loop_back)
+        self._loop = HeldLoop(self._script.deliveries.append, self._set_loop_back)
         self._middleware = NullMiddleware(file, self._loop)
         lacking = recorded.lacking()
         self.comparison = Comparison(recorded.sent(), recorded.message, lacking)
@@ -184,12 +184,12 @@ class ReplayedNode:
 
     @property
     def expects_start(self) -> bool:
-        """Whether more hooks have started in the run."""
+        """Whether more hooks started in the run."""
         return self._script.expects_start
 
     @property
     def has_outputs(self) -> bool:
-        """Whether the node has a connection or external topic to send on."""
+        """Whether the node sends on a connection or external topic."""
         name = self._file.node.name
         is_sender = any(c.source_node == name for c in self._file.connections)
         return is_sender or any(port.external_topic for port in self._file.node.outputs)
@@ -206,10 +206,8 @@ class ReplayedNode:
             self._runtime.finalise()
         self._middleware.close()
 
-    # ------------------------------------------------------------------ source
-
     def packet(self, key: Connection | str, number: int) -> Any:
-        """The packet that arrived as the ``number``-th on a connection or external topic."""
+        """The ``number``-th packet that arrived on a connection or external topic."""
         data = self._recorded.arrived(key, number)
         if data is None:
             self.notes.append(
@@ -227,11 +225,11 @@ class ReplayedNode:
         return packet
 
     def offer(self) -> None:
-        """Wait for packets from the plugin's thread, and offer them to the engine."""
+        """Wait for packets from a thread of the plugin, and give them to the engine."""
         self._engine.has_offer = False
         while not self._engine.has_offer:
             try:
-                event = self._loop.from_threads.get(timeout=_LOOK_S)
+                event = self._loop.from_threads.get(timeout=_POLL_S)
             except queue.Empty:
                 if threading.active_count() > 1:
                     continue
@@ -241,15 +239,13 @@ class ReplayedNode:
                 ) from None
             event()
 
-    # ------------------------------------------------------------------ inside
-
     @property
     def _engine(self) -> ReplayedEngine:
         engine: Engine | None = self._runtime.engine
         assert isinstance(engine, ReplayedEngine)
         return engine
 
-    def _note_loop_back(self, event: Callable[[], None]) -> None:
+    def _set_loop_back(self, event: Callable[[], None]) -> None:
         self._script.loop_back = event
 
     def _play(self) -> None:
@@ -269,7 +265,7 @@ class ReplayedNode:
             self.difference = self.comparison.difference
 
     def _end(self) -> None:
-        """The event log is at its end."""
+        """Judge the replay at the end of the event log."""
         if not is_whole(self._recorded.event_log):
             self.notes.append(
                 f"the event log of the run ends after {self.starts} starts of hooks (the node was"
@@ -292,7 +288,7 @@ class ReplayedNode:
 
 
 def files_changed_since(run_folder: Path, file: NodeFile) -> list[Path]:
-    """The plugin, and Python files beside it, that were changed after the run had begun."""
+    """Python files in the folder of the plugin that were changed after the start of the run."""
     begun = (run_folder / "project.json").stat().st_mtime
     beside = sorted(file.node.plugin.parent.glob("*.py"))
     return [path for path in beside if path.stat().st_mtime > begun]
@@ -309,18 +305,18 @@ class Debugger:
         for function in functions:
             code = function.__code__
             self._pdb.set_break(code.co_filename, code.co_firstlineno, funcname=code.co_name)
-        self._pdb.rcLines = ["continue"]  # it would stop in NeuROS first
+        self._pdb.rcLines = ["continue"]  # pdb would stop in NeuROS first
         self._pdb.runcall(action)
 
     def look_at(self, error: BaseException) -> None:
-        """Let the user look at where an error came from."""
+        """Open the debugger where an error was raised."""
         print(f"{type(error).__name__}: {error}")
         self._pdb.reset()
         self._pdb.interaction(None, error.__traceback__)
 
 
 def is_quit(error: BaseException | None) -> bool:
-    """Whether the user has left a debugger, or pressed Ctrl+C: anywhere in an error's causes."""
+    """Whether an error, or one of its causes, is the end of a debugger or Ctrl+C."""
     while error is not None:
         if isinstance(error, bdb.BdbQuit | KeyboardInterrupt):
             return True
