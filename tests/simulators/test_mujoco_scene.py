@@ -133,10 +133,10 @@ class Stepped:
             mujoco.mj_step(self.model, self.data)
             self.now_s += wall_s
             if self.view.is_watched:
-                self.view.note()
+                self.view.record()
 
     def look(self, asker: int = 1, **wanted: bool) -> dict[str, Any]:
-        return self.view.look(wanted, asker)
+        return self.view.observe(wanted, asker)
 
     def frames(self, asker: int = 1) -> list[list[Any]]:
         frames: list[list[Any]] = self.look(asker, frames=True)["frames"]

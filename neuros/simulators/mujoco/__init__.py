@@ -13,27 +13,21 @@ An output has a sensor behind it::
 
 import os
 
-
-def _import_mujoco() -> None:
-    """Import MuJoCo, also where the OpenGL that ``MUJOCO_GL`` names cannot be imported.
-
-    MuJoCo imports that at once, and only cameras need it: they name what is missing.
-    """
+try:
+    import mujoco
+except Exception:
+    # MuJoCo imports the OpenGL that MUJOCO_GL names at once. Only cameras need OpenGL: they report
+    # what is missing.
+    _chosen = os.environ.get("MUJOCO_GL")
+    if not _chosen:
+        raise
+    os.environ["MUJOCO_GL"] = "disable"
     try:
-        import mujoco
-    except Exception:
-        chosen = os.environ.get("MUJOCO_GL")
-        if not chosen:
-            raise
-        os.environ["MUJOCO_GL"] = "disable"
-        try:
-            import mujoco  # noqa: F401
-        finally:
-            os.environ["MUJOCO_GL"] = chosen
+        import mujoco  # noqa: F401
+    finally:
+        os.environ["MUJOCO_GL"] = _chosen
 
 
-_import_mujoco()
-
-from neuros.simulators.mujoco.simulator import MuJoCo  # noqa: E402
+from neuros.simulators.mujoco.simulator import MuJoCo
 
 __all__ = ["MuJoCo"]

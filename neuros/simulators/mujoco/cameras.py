@@ -34,9 +34,9 @@ _NAMES = {"egl": "EGL", "osmesa": "OSMesa", "glfw": "GLFW"}
 
 
 def choose_opengl() -> str:
-    """``"egl"``, ``"osmesa"`` or ``"glfw"``: what ``MUJOCO_GL`` names, else what there is here.
+    """The OpenGL to render with: ``"egl"``, ``"osmesa"``, ``"glfw"``, or ``""`` for none.
 
-    ``""`` where there is nothing; systems other than Linux have one OpenGL, which GLFW finds.
+    ``MUJOCO_GL`` wins over the libraries found. Systems other than Linux have GLFW's only.
     """
     if not sys.platform.startswith("linux"):
         return "glfw"
@@ -53,7 +53,7 @@ def import_opengl() -> Any:
     """
     choice = choose_opengl()
     with _opengl_faults():
-        # Asked for directly: mujoco.GLContext was fixed when mujoco was imported.
+        # mujoco.GLContext was fixed when mujoco was imported, so each module is imported here.
         if choice == "egl":
             from mujoco.egl import GLContext
         elif choice == "osmesa":
@@ -67,11 +67,11 @@ def import_opengl() -> Any:
 
 @contextmanager
 def _opengl_faults() -> Iterator[None]:
-    """Turn what PyOpenGL and MuJoCo raise where a library is missing into ``EnvironmentFault``."""
+    """Turn the errors of PyOpenGL and MuJoCo about a missing library into ``EnvironmentFault``."""
     try:
         yield
     except Exception as error:
-        # PyOpenGL takes what it has not found for None, and fails later, anyhow.
+        # PyOpenGL stores None for a library it has not found, and fails later with any error.
         text = " ".join(str(error).split())
         chosen = os.environ.get("MUJOCO_GL")
         choice = f", with MUJOCO_GL={chosen}" if chosen else ""
@@ -93,10 +93,10 @@ class _Resources:
 
 
 class Cameras:
-    """Renders a model's cameras; one OpenGL context serves all of them, at all sizes.
+    """Renders a model's cameras; one OpenGL context serves all cameras and sizes.
 
-    The context is made at the first image, in the thread that asks for it, and must be closed in
-    that thread. ``fine`` adds shadows and reflections, which cost about three times as much.
+    The first image makes the context; the same thread must close it. ``fine`` adds shadows and
+    reflections, which cost about three times as much.
     """
 
     def __init__(self, model: Any, *, fine: bool = False) -> None:
@@ -106,11 +106,11 @@ class Cameras:
         self._pixels: dict[tuple[int, ...], npt.NDArray[np.uint8]] = {}
 
     def use(self, model: Any) -> None:
-        """Render another model from the next image on; any thread that has its turn."""
+        """Render another model from the next image on; callable from any thread between images."""
         self._model = model
 
     def render(self, data: Any, camera: int, image: npt.NDArray[np.uint8]) -> None:
-        """Fill ``image`` with what a camera sees: RGB, shape (height, width, 3), top row first."""
+        """Fill ``image`` with a camera's picture: RGB, shape (height, width, 3), top row first."""
         height, width, _ = image.shape
         held, area = self._draw(data, camera, width, height)
         pixels = self._pixels.get(image.shape)
@@ -150,7 +150,7 @@ class Cameras:
         return held, area
 
     def close(self) -> None:
-        """Free the OpenGL context; the next image makes a new one."""
+        """Free the OpenGL context; the next image opens a new one."""
         held, self._resources = self._resources, None
         if held is not None:
             held.gl.make_current()
@@ -173,9 +173,9 @@ class Cameras:
 
 
 def render_one_picture() -> int:
-    """Render a small picture, and print with which OpenGL; for a process of its own.
+    """Render a small picture in a process of its own, and print the OpenGL that rendered it.
 
-    Returns the exit code: 4 if it cannot, and standard error says why.
+    Returns the exit code: 4 with the reason on standard error if rendering fails.
     """
     model = mujoco.MjModel.from_xml_string(_SMALL_WORLD)
     data = mujoco.MjData(model)

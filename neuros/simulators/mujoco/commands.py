@@ -1,6 +1,6 @@
-"""Commands: actuators that inputs drive, declared in the node file, and their ROS messages.
+"""Commands: inputs that drive actuators, declared in the node file, and their ROS messages.
 
-For a joint without an actuator, as those of URDF, the node file declares one, a drive:
+For a joint without an actuator the node file declares a drive:
 ``{"joint": "elbow", "drive": "position", "kp": 50, "kv": 5, "force_limit": 10}``. MuJoCo clamps a
 control to the ``ctrlrange`` of its actuator. ``docs/simulators.md`` has the message types.
 """
@@ -21,7 +21,6 @@ from neuros.simulators.mujoco.lookup import (
     Faults,
     Problems,
     did_you_mean,
-    either,
     find,
     id_of,
     is_list_of_names,
@@ -50,7 +49,10 @@ _DRIVE_KEYS = ("drive", "kp", "kv", "force_limit")
 
 @dataclass(frozen=True)
 class Drive:
-    """An actuator for a joint; gains in N/m and N s/m, or N m/rad and N m s/rad."""
+    """An actuator that the node file adds to a joint.
+
+    ``kp`` is in N/m or N m/rad, ``kv`` in N s/m or N m s/rad, ``force_limit`` in N or N m.
+    """
 
     kind: str
     kp: float = 0.0
@@ -62,7 +64,7 @@ class Drive:
 class CommandDeclaration:
     """The actuators behind an input, in their order. ``pointer`` is the place of their names.
 
-    With a ``drive`` the names are those of joints, and each gets an actuator of its name.
+    With a ``drive`` the names are joints, and each joint gets an actuator of its name.
     """
 
     input: str
@@ -86,7 +88,7 @@ def _command(port: Port, pointer: str, problems: Problems) -> CommandDeclaration
     faults = Faults(pointer, problems)
     given = [key for key in _NAMING if key in port.mujoco]
     if len(given) != 1:
-        faults.add("", f"give either {either([repr(key) for key in _NAMING])}")
+        faults.add("", f"give either {' or '.join(map(repr, _NAMING))}")
         return None
     (key,) = given
     drives = key in ("joint", "joints")
@@ -98,11 +100,11 @@ def _command(port: Port, pointer: str, problems: Problems) -> CommandDeclaration
         return None
     drive = _read_drive(port.mujoco, faults) if drives else None
     if port.type not in _MESSAGE_TYPES:
-        if drive is None:  # with one, the plugin may read the message, and drive joint by joint
-            known = either(tuple(_MESSAGE_TYPES))
+        if drive is None:  # with a drive, the plugin may read the message and drive each joint
+            known = " or ".join(_MESSAGE_TYPES)
             faults.add(key, f"input '{port.name}' is a {port.type}; a command is {known}")
     elif (sizes := _MESSAGE_TYPES[port.type][1]) and len(names) not in sizes:
-        some = either([str(size) for size in sizes])
+        some = " or ".join(map(str, sizes))
         faults.add(key, f"a {port.type} drives {some} actuators, not {len(names)}")
     if faults.found:
         return None
@@ -132,33 +134,29 @@ def _read_drive(declared: Mapping[str, Any], faults: Faults) -> Drive | None:
 def add_drives(
     spec: Any, joints: Collection[str], commands: Iterable[CommandDeclaration], problems: Problems
 ) -> None:
-    """Add the actuators that the node file declares for some of ``joints``; problems are reported.
+    """Add the actuators that the node file declares for ``joints`` to an ``MjSpec``.
 
-    Joints that are missing are found when the commands are bound.
+    A joint that the model lacks is reported when the commands are bound.
     """
     for command in commands:
-        if command.drive is None:
+        drive = command.drive
+        if drive is None:
             continue
-        for name in command.actuators:
-            if name in joints and (fault := _add_drive(spec, name, command.drive)):
+        for name in filter(joints.__contains__, command.actuators):
+            if spec.actuator(name) is not None:
+                fault = f"the model has an actuator '{name}': name that with 'actuator'"
                 problems.add(command.pointer, fault)
-
-
-def _add_drive(spec: Any, joint: str, drive: Drive) -> str:
-    """Add an actuator called as its joint to an ``MjSpec``; returns what is wrong, or nothing."""
-    if spec.actuator(joint) is not None:
-        return f"the model has an actuator '{joint}': name that with 'actuator'"
-    actuator = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-    if drive.kind == "position":
-        actuator.set_to_position(kp=drive.kp, kv=drive.kv)
-    elif drive.kind == "velocity":
-        actuator.set_to_velocity(kv=drive.kv)
-    else:
-        actuator.set_to_motor()
-    if drive.force_limit is not None:
-        actuator.forcelimited = True
-        actuator.forcerange = [-drive.force_limit, drive.force_limit]
-    return ""
+                continue
+            actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+            if drive.kind == "position":
+                actuator.set_to_position(kp=drive.kp, kv=drive.kv)
+            elif drive.kind == "velocity":
+                actuator.set_to_velocity(kv=drive.kv)
+            else:
+                actuator.set_to_motor()
+            if drive.force_limit is not None:
+                actuator.forcelimited = True
+                actuator.forcerange = [-drive.force_limit, drive.force_limit]
 
 
 def bind_commands(
@@ -202,7 +200,7 @@ def _checked(where: str, command: Command) -> Command:
 
 
 def _refuse(model: Any, actuators: list[int], where: str) -> Command:
-    """For a message of the user's own: its plugin reads it, and drives the joints itself."""
+    """A message type of the user: the plugin must read it, and drive the joints itself."""
     names = [names_of(model, "actuator")[index] for index in actuators]
 
     def read(packet: Packet) -> Controls:
@@ -238,7 +236,17 @@ def _twist(model: Any, actuators: list[int], where: str) -> Command:
 
 
 def _joint_state(model: Any, actuators: list[int], where: str) -> Command:
-    targets = _targets_by_name(model, actuators)
+    joints, names = names_of(model, "joint"), names_of(model, "actuator")
+    on_joint = (mujoco.mjtTrn.mjTRN_JOINT.value, mujoco.mjtTrn.mjTRN_JOINTINPARENT.value)
+    # By actuator and joint name: actuators, and the field of a JointState that drives each.
+    targets: dict[str, list[tuple[int, str]]] = {}
+    for index in actuators:
+        target = (index, _field(model, index))
+        if model.actuator_trntype[index] in on_joint:
+            targets.setdefault(joints[model.actuator_trnid[index, 0]], []).append(target)
+    targets.pop("", None)
+    # The name of an actuator means that one alone, even where a joint has the same name.
+    targets.update({names[index]: [(index, _field(model, index))] for index in actuators})
 
     def read(packet: Packet) -> Controls:
         controls: Controls = []
@@ -262,23 +270,8 @@ def _joint_state(model: Any, actuators: list[int], where: str) -> Command:
     return read
 
 
-def _targets_by_name(model: Any, actuators: list[int]) -> Mapping[str, list[tuple[int, str]]]:
-    """Actuators, and the field of a JointState that each takes, by actuator and joint name."""
-    joints, names = names_of(model, "joint"), names_of(model, "actuator")
-    on_joint = (mujoco.mjtTrn.mjTRN_JOINT.value, mujoco.mjtTrn.mjTRN_JOINTINPARENT.value)
-    targets: dict[str, list[tuple[int, str]]] = {}
-    for index in actuators:
-        target = (index, _field(model, index))
-        if model.actuator_trntype[index] in on_joint:
-            targets.setdefault(joints[model.actuator_trnid[index, 0]], []).append(target)
-    targets.pop("", None)
-    # The name of an actuator means that one alone, even where a joint has the same name.
-    targets.update({names[index]: [(index, _field(model, index))] for index in actuators})
-    return targets
-
-
 def _field(model: Any, actuator: int) -> str:
-    """The field of a JointState that drives an actuator; a servo subtracts what it measures."""
+    """The field of a JointState that drives an actuator: the quantity that a servo subtracts."""
     if model.actuator_biastype[actuator] != mujoco.mjtBias.mjBIAS_AFFINE.value:
         return "effort"
     _, of_position, of_velocity = model.actuator_biasprm[actuator, :3]
@@ -293,4 +286,4 @@ _MESSAGE_TYPES: Mapping[str, tuple[Callable[[Any, list[int], str], Command], tup
     "sensor_msgs/msg/JointState": (_joint_state, ()),
     "geometry_msgs/msg/Twist": (_twist, (2, 3, 6)),
 }
-"""For each the reader of its packets, and how many actuators it can drive (empty: any number)."""
+"""For each type the factory of its command, and how many actuators it can drive (empty: any)."""

@@ -22,12 +22,14 @@ _SORTS = {
 
 
 class Problems:
-    """Gathers what is wrong in one file, and raises all of it in one ``ModelError``.
+    """Problems of one file, raised together in one ``ModelError``.
 
-    ``hint`` stands at the end of each.
+    Args:
+        file: named at the start of each problem.
+        hint: added to the end of each.
 
     Attributes:
-        found: of each the pointer, empty where it is of another file, and the text.
+        found: (pointer, text) of each problem; the pointer is empty for one of another file.
     """
 
     def __init__(self, file: object, hint: str = "") -> None:
@@ -38,7 +40,7 @@ class Problems:
         self.found.append((pointer, f"{text}{self._hint}"))
 
     def add_text(self, text: str) -> None:
-        """A problem of another file, with its address already in the text."""
+        """Add a problem of another file; the text names that file."""
         self.found.append(("", text))
 
     def raise_any(self) -> None:
@@ -81,10 +83,6 @@ def is_list_of_names(value: object) -> bool:
         and all(isinstance(name, str) and name for name in value)
         and len(set(value)) == len(value)
     )
-
-
-def either(types: Sequence[str]) -> str:
-    return " or ".join(types)
 
 
 def names_of(model: Any, sort: str) -> list[str]:

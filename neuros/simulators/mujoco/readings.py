@@ -24,27 +24,23 @@ from neuros.simulators.mujoco.sensor_base import (
 _OPTICAL = np.array([0.0, 1.0, 0.0, 0.0])
 """From the axes of MuJoCo's cameras (y up, looking along -z) to those of REP 103 (y down, z)."""
 _FLOATS = "std_msgs/msg/Float64MultiArray"
-# Measured at a site, along its axes.
+# These sensors measure at a site, along its axes.
 _LOCAL = {"accelerometer", "velocimeter", "gyro", "force", "torque", "magnetometer", "rangefinder"}
 _INFRARED = 1
 
 
 class _Form(NamedTuple):
-    """How a message takes a reading.
+    """How a message type holds a reading.
 
     Attributes:
-        numbers: how many it holds.
-        put: fills it.
-        kinds: MuJoCo's kinds of sensors that it is for; empty: any with so many numbers.
+        numbers: how many numbers it holds.
+        put: writes them into a message.
+        kinds: the kinds of MuJoCo sensors that fit; empty: any with that many numbers.
     """
 
     numbers: int
     put: Callable[[Packet, Vector, Reading], object]
     kinds: tuple[str, ...] = ()
-
-
-def _put_wrench(packet: Packet, values: Vector, sensor: Reading) -> None:
-    set_vector(getattr(packet.wrench, sensor.kinds[0]), values)
 
 
 def _put_field(packet: Packet, values: Vector, sensor: Reading) -> None:
@@ -55,7 +51,7 @@ def _put_field(packet: Packet, values: Vector, sensor: Reading) -> None:
 def _put_range(packet: Packet, values: Vector, sensor: Reading) -> None:
     packet.radiation_type = _INFRARED
     packet.max_range = sensor.cutoff or float("inf")
-    # MuJoCo's -1 is "nothing there": +inf in REP 117.
+    # MuJoCo writes -1 where nothing is hit, REP 117 +inf.
     packet.range = values[0] if values[0] >= 0 else float("inf")
 
 
@@ -67,7 +63,11 @@ _FORMS: Mapping[str, _Form] = {
     "geometry_msgs/msg/PointStamped": _Form(
         3, lambda p, v, _: set_vector(p.point, v), ("framepos", "subtreecom")
     ),
-    "geometry_msgs/msg/WrenchStamped": _Form(3, _put_wrench, ("force", "torque")),
+    "geometry_msgs/msg/WrenchStamped": _Form(
+        3,
+        lambda p, v, sensor: set_vector(getattr(p.wrench, sensor.kinds[0]), v),
+        ("force", "torque"),
+    ),
     "sensor_msgs/msg/MagneticField": _Form(3, _put_field, ("magnetometer",)),
     "geometry_msgs/msg/Quaternion": _Form(4, lambda p, v, _: set_quaternion(p, v)),
     "geometry_msgs/msg/QuaternionStamped": _Form(
@@ -79,13 +79,13 @@ _FORMS: Mapping[str, _Form] = {
 class Reading(Sensor):
     """The reading of a sensor of the model (MJCF's sensor); a list of them: all their numbers.
 
-    Units and axes are MuJoCo's, along those of the site for ``gyro`` and the like. ``force`` and
-    ``torque`` fill their half of a WrenchStamped: what a child does to its parent. Any sensor fits
-    into a Float64MultiArray, as MuJoCo has it. No noise is added.
+    Units and axes are MuJoCo's; ``gyro`` and the like measure along the axes of their site.
+    ``force`` and ``torque`` fill their half of a WrenchStamped: the load of a child on its parent.
+    A Float64MultiArray holds any sensor. No noise is added.
 
     Attributes:
-        kinds: MuJoCo's kind of each sensor, ``"gyro"``.
-        noise, cutoff: of the first.
+        kinds: MuJoCo's kind of each sensor, as ``"gyro"``.
+        noise, cutoff: of the first sensor.
     """
 
     kind = "reading"
@@ -99,7 +99,7 @@ class Reading(Sensor):
             slice(int(model.sensor_adr[i]), int(model.sensor_adr[i] + model.sensor_dim[i]))
             for i in indices
         ]
-        self.kinds = [
+        self.kinds: list[str] = [
             mujoco.mjtSensor(int(model.sensor_type[i])).name.removeprefix("mjSENS_").lower()
             for i in indices
         ]
@@ -131,7 +131,7 @@ class Reading(Sensor):
         return form.numbers == count and (not form.kinds or self.kinds[0] in form.kinds)
 
     def _frame_of(self, index: int) -> str:
-        """The frame whose axes the reading is along; empty where it has none."""
+        """The frame along whose axes the sensor measures; empty where it has none."""
         model, kind = self.model, self.kinds[0]
         if kind in _LOCAL:
             sort, element = model.sensor_objtype[index], model.sensor_objid[index]
@@ -147,8 +147,8 @@ class Reading(Sensor):
 class Transforms(Sensor):
     """Transforms of bodies, sites and cameras, for /tf; of all named bodies if none is given.
 
-    The parent of each is the nearest body above it that is among them, else ``world``. A camera's
-    frame is the optical one of REP 103, as its pictures have it: z forward, x right, y down.
+    The parent of each is the nearest listed body above it, else ``world``. A camera's frame is the
+    optical one of REP 103, like that of its pictures: z forward, x right, y down.
     """
 
     kind = "tf"

@@ -1,6 +1,6 @@
-"""A world as a browser draws it: geometry of the compiled model, once, and poses of what moves.
+"""A world for a browser: the geometry of the compiled model, once, and poses of moving bodies.
 
-Nothing is rendered here. The geometry is JSON; arrays in it are compressed (zlib) and in base64.
+Nothing is rendered here. The geometry is JSON; its arrays are zlib-compressed, in base64.
 """
 
 from __future__ import annotations
@@ -20,30 +20,31 @@ FRAMES_PER_S = 30
 _PERIOD_S = 1 / FRAMES_PER_S
 _WATCHED_S = 2.0
 _MOST_FRAMES = 60
-_MOST_GROUP = 2  # as MuJoCo's own viewer: elements of the groups 3 to 5 are hidden at first
+_MOST_GROUP = 2  # MuJoCo's own viewer hides the groups 3 to 5 at first, too
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
 _GEOMS = mujoco.mjtGeom
 _SHAPES = {
     getattr(_GEOMS, f"mjGEOM_{name.upper()}").value: name
     for name in ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh")
 } | {_GEOMS.mjGEOM_HFIELD.value: "mesh", _GEOMS.mjGEOM_SDF.value: "mesh"}
+_LIGHT_VECTORS = ("pos", "dir", "diffuse", "ambient")
 _MATERIAL = ("emission", "specular", "shininess")
-# What a plugin may change while the world runs.
-_LOOKS = ("geom_rgba", "geom_size", "geom_pos", "geom_quat", "mat_rgba", "site_rgba", "site_pos")
+# A plugin may change these while the world runs.
+_VISIBLE = ("geom_rgba", "geom_size", "geom_pos", "geom_quat", "mat_rgba", "site_rgba", "site_pos")
 
 
 class WorldView:
-    """What observers see of a world: its geometry, and poses while they ask for them.
+    """A world as observers see it: its geometry, and its poses while observers ask for them.
 
-    The thread that steps calls :meth:`stepping` and :meth:`note`, any other one :meth:`look`.
+    The stepping thread calls :meth:`record`, other threads call :meth:`observe`.
 
     Args:
-        world: gives the model and the data of now, and the simulated time in seconds.
+        world: returns the present model and data, and the simulated time in seconds.
         clock: wall clock in seconds.
 
     Attributes:
-        is_watched: whether :meth:`note` is wanted after each step.
-        is_stepping: whether the data may change now.
+        is_watched: whether the stepping thread must call :meth:`record` after each step.
+        is_stepping: whether the data may change now; the stepping thread sets it.
     """
 
     def __init__(
@@ -62,8 +63,8 @@ class WorldView:
         self._moving = _Moving()
         self._wants_contacts = False
 
-    def note(self) -> None:
-        """Keep the poses of now, at most 30 times per second."""
+    def record(self) -> None:
+        """Keep the present poses, at most 30 times per second."""
         now_s = self._clock()
         if now_s > self._watched_until_s:
             self.is_watched = False
@@ -72,37 +73,40 @@ class WorldView:
             self._count += 1
             self._frames.append((self._count, self._frame(now_s)))
 
-    def look(self, wanted: Mapping[str, Any], asker: int) -> dict[str, Any]:
-        """The version of the geometry, and what is wanted.
+    def observe(self, wanted: Mapping[str, Any], asker: int) -> dict[str, Any]:
+        """The version of the geometry, and the wanted parts.
 
         Args:
-            wanted: ``frames``: poses since the asker's last question, and from now on;
-                ``contacts``: points of contact with them; ``geometry``: that of this version.
+            wanted: ``frames``: poses since the asker's last call, and recording from now on;
+                ``contacts``: contact points in these frames; ``geometry``: the whole geometry.
+            asker: identifies the observer.
         """
         model, *_ = self._world()
         if model is not self._model:
             self._moving = _Moving(model)
             self._frames.clear()
             self._model, self._models = model, self._models + 1
-        found: dict[str, Any] = {"version": f"{self._models}-{_crc_of_looks(model):x}"}
+        crc = 0
+        for name in _VISIBLE:
+            crc = zlib.crc32(getattr(model, name).tobytes(), crc)
+        found: dict[str, Any] = {"version": f"{self._models}-{crc:x}"}
         if wanted.get("geometry"):
             found["geometry"] = json.dumps({**found, **geometry(model)})
-        if wanted.get("frames"):
-            found["frames"] = self._frames_for(asker, bool(wanted.get("contacts")))
-        return found
-
-    def _frames_for(self, asker: int, wants_contacts: bool) -> list[list[Any]]:
+        if not wanted.get("frames"):
+            return found
         now_s = self._clock()
-        self._watched_until_s, self._wants_contacts = now_s + _WATCHED_S, wants_contacts
-        self.is_watched = True  # first: if a step begins now, its end is noted
+        self._watched_until_s = now_s + _WATCHED_S
+        self._wants_contacts = bool(wanted.get("contacts"))
+        # Set before is_stepping is read: a step that begins in between is recorded at its end.
+        self.is_watched = True
         last = self._given.get(asker, self._count)
         frames = [frame for number, frame in tuple(self._frames) if number > last]
-        if not frames and not self.is_stepping:  # it may stand still for long
+        if not frames and not self.is_stepping:  # the world may stand still for long
             frame = self._frame(now_s)
             if not self.is_stepping:
                 frames.append(frame)
         self._given[asker] = self._count
-        return frames
+        return found | {"frames": frames}
 
     def _frame(self, now_s: float) -> list[Any]:
         """Wall and simulated time in seconds, poses, and contacts if they are wanted."""
@@ -115,10 +119,10 @@ class WorldView:
 
 
 class _Moving:
-    """What moves in a model: bodies by joints, mocap, or their parents; cameras that track.
+    """Moving parts of a model: bodies with joints, mocap bodies, their children, tracking cameras.
 
     Attributes:
-        bodies, cameras: their numbers.
+        bodies, cameras: their ids.
     """
 
     def __init__(self, model: Any = None) -> None:
@@ -144,12 +148,12 @@ class _Moving:
 
 
 def geometry(model: Any) -> dict[str, Any]:
-    """What is drawn of a model, ready for JSON; lengths in metres, quaternions as w, x, y, z.
+    """The drawn parts of a model, ready for JSON; lengths in metres, quaternions as w, x, y, z.
 
-    ``bodies`` have the pose of the initial state; ``moving`` are those with a row in each frame, in
-    its order, before ``moving_cameras``; ``roots`` are those of them on which the others hang,
-    bodies with joints first. Geoms, sites, lights and cameras are relative to their
-    body. Geoms of groups that MuJoCo's viewer hides, skins, flexes and tendons are left out.
+    ``bodies`` have the pose of the initial state. ``moving`` are the bodies with a row in each
+    frame, in its order, before ``moving_cameras``; ``roots`` are the moving bodies on fixed
+    parents, those with joints first. Geoms, sites, lights and cameras are relative to their body.
+    Geoms of groups that MuJoCo's viewer hides, skins, flexes and tendons are left out.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -174,7 +178,16 @@ def geometry(model: Any) -> dict[str, Any]:
         ],
         "meshes": meshes.found,
         "textures": [_texture(model, number) for number in range(model.ntex)],
-        "lights": list(_lights(model)),
+        "lights": [
+            {
+                "type": int(light.type[0]),
+                "body": int(light.bodyid[0]),
+                **{name: getattr(light, name).tolist() for name in _LIGHT_VECTORS},
+                "cutoff": float(light.cutoff[0]),
+            }
+            for light in map(model.light, range(model.nlight))
+            if light.active[0]
+        ],
         "cameras": [
             {
                 "name": camera.name or f"camera {camera.id}",
@@ -244,20 +257,8 @@ def _material(material: Any) -> dict[str, Any]:
     return found
 
 
-def _lights(model: Any) -> Iterator[dict[str, Any]]:
-    for light in map(model.light, range(model.nlight)):
-        if light.active[0]:
-            vectors = ("pos", "dir", "diffuse", "ambient")
-            yield {
-                "type": int(light.type[0]),
-                "body": int(light.bodyid[0]),
-                **{name: getattr(light, name).tolist() for name in vectors},
-                "cutoff": float(light.cutoff[0]),
-            }
-
-
 class _Meshes:
-    """The meshes and height fields that geoms use, each once."""
+    """The meshes and height fields of geoms, each once."""
 
     def __init__(self, model: Any) -> None:
         self._model = model
@@ -269,11 +270,11 @@ class _Meshes:
         is_field = kind == mujoco.mjtGeom.mjGEOM_HFIELD.value
         if (is_field, data_id) not in self._numbers:
             self._numbers[is_field, data_id] = len(self.found)
-            self.found.append((self._field if is_field else self._mesh)(data_id))
+            self.found.append((self._field if is_field else self._surface)(data_id))
         return self._numbers[is_field, data_id]
 
-    def _mesh(self, mesh: int) -> dict[str, str]:
-        """Vertices with normals (and texture coordinates), of which each face names three.
+    def _surface(self, mesh: int) -> dict[str, str]:
+        """Vertices with normals (and texture coordinates), and three vertex numbers per face.
 
         MuJoCo numbers vertices, normals and coordinates apart; a browser has one number for all.
         """
@@ -301,7 +302,7 @@ class _Meshes:
         return found
 
     def _field(self, field: int) -> dict[str, str]:
-        """The surface of a height field; the browser works out its normals."""
+        """The surface of a height field; the browser computes its normals."""
         model = self._model
         rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
         begin = model.hfield_adr[field]
@@ -348,10 +349,3 @@ def _text(values: Any) -> str:
 
 def _packed(values: Any) -> str:
     return base64.b64encode(zlib.compress(np.ascontiguousarray(values).tobytes(), 1)).decode()
-
-
-def _crc_of_looks(model: Any) -> int:
-    crc = 0
-    for name in _LOOKS:
-        crc = zlib.crc32(getattr(model, name).tobytes(), crc)
-    return crc

@@ -1,4 +1,4 @@
-"""The common part of MuJoCo sensors: declaration, base class, frames, parts of messages."""
+"""The common part of MuJoCo sensors: declaration, base class, frames, and parts of messages."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from neuros.simulators.mujoco.lookup import Problems, find
 from neuros.time import to_stamp
 
 Vector: TypeAlias = "list[float]"
-"""3 numbers, or 4 for a quaternion, w first: plain ones, as messages want them."""
+"""3 numbers, or 4 for a quaternion, w first, as plain floats."""
 
 WORLD_FRAME = "world"
 
 
 class Key(NamedTuple):
-    """A key of a declaration that holds a number.
+    """A key of a declaration with a numeric value.
 
     Attributes:
-        default: its value where it is left out.
-        what: what it must be, for messages.
+        default: the value where the key is left out.
+        what: a description of valid values, for messages.
     """
 
     default: float
@@ -37,7 +37,7 @@ class Key(NamedTuple):
     most: float = math.inf
 
     def holds(self, value: Any) -> bool:
-        """Whether a value is right."""
+        """Whether a value is valid."""
         kinds = int if self.is_whole else (int, float)
         is_number = isinstance(value, kinds) and not isinstance(value, bool)
         return is_number and math.isfinite(value) and self.least <= value <= self.most
@@ -80,13 +80,13 @@ class Sensor:
     The first line of a subclass's docstring describes it in the schema.
 
     Attributes:
-        kind: what ``"sensor"`` in a node file says.
+        kind: the value of ``"sensor"`` in a node file.
         types: the message types that it can fill.
-        list_types: those of them that take a list of elements.
-        sorts: the sorts of elements it measures, empty for none; the first that has the name wins.
+        list_types: those of them that hold a list of elements.
+        sorts: the sorts of elements it measures; the first sort that has the name wins.
         is_optional: whether the element may be left out.
         keys: further keys of its declaration.
-        is_rendered: whether it takes pictures.
+        is_rendered: whether it renders pictures.
         declared: the declaration.
         elements: sort and id of each element that it names.
     """
@@ -110,7 +110,7 @@ class Sensor:
             self.bind(problems)
 
     def bind(self, problems: Problems) -> None:
-        """Prepare to measure the elements, once; what is wrong with them is reported."""
+        """Prepare to measure the elements, once; problems with them are reported."""
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         """Fill a message from the data right after ``mj_forward``."""
@@ -131,8 +131,8 @@ def set_quaternion(quaternion: Any, values: Vector) -> None:
     quaternion.w, quaternion.x, quaternion.y, quaternion.z = values
 
 
-class Place:
-    """The frame of a site, or of a body (its own frame, not the one of its inertia)."""
+class Frame:
+    """The frame of a site, or of a body (the body's own frame, not that of its inertia)."""
 
     def __init__(self, model: Any, sort: str, index: int) -> None:
         self._model, self._is_site, self.index = model, sort == "site", index
@@ -156,12 +156,12 @@ class Place:
         return listed(self._turned)
 
     def angular_velocity(self, data: Any) -> Vector:
-        """In the frame of the place, rad/s: a gyroscope."""
+        """In this frame, rad/s: a gyroscope."""
         mujoco.mj_objectVelocity(self._model, data, self.object, self.index, self._spatial, 1)
         return listed(self._spatial[:3])
 
     def acceleration(self, data: Any) -> Vector:
-        """In the frame of the place, m/s^2, gravity included: an accelerometer."""
+        """In this frame, m/s^2, gravity included: an accelerometer."""
         # mj_forward leaves the accelerations out unless a sensor of the model needs them.
         if not getattr(data, "flg_rnepost", False):
             mujoco.mj_rnePostConstraint(self._model, data)

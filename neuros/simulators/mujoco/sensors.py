@@ -1,14 +1,13 @@
-"""Sensors: a class each, with what a node file declares, the units, and how it fills a message.
+"""Sensors: a class each, with the keys of its declaration, the units, and how it fills a message.
 
 To add one, write a subclass of :class:`Sensor` here and name it in :data:`SENSORS`; then
 :func:`write_schema` puts it into the schema of node files.
 
-Declarations are read and checked without a model. All problems are gathered. A sensor looks its
-elements up once, by name; at a firing it only fills a packet, from the data after ``mj_forward``.
-Where the model has a sensor of its own at the element (``gyro``, ``accelerometer``, ``framequat``),
-its reading is taken, with its cutoff. Otherwise the quantity is computed from the data, as MuJoCo's
-sensors compute it. Distances are metres. As in REP 117, ``inf`` is "nothing within range", ``-inf``
-"too close".
+Declarations are read and checked without a model, and all problems are gathered. A sensor finds its
+elements once, by name, and fills packets from the data after ``mj_forward``. Where the model has a
+sensor at the element (``gyro``, ``accelerometer``, ``framequat``) its reading is used, with its
+cutoff; otherwise the quantity is computed as MuJoCo's sensors compute it. Distances are metres. As
+in REP 117, ``inf`` is "nothing within range", ``-inf`` "too close".
 """
 
 from __future__ import annotations
@@ -33,7 +32,6 @@ from neuros.simulators.mujoco.lookup import (
     Faults,
     Problems,
     did_you_mean,
-    either,
     is_list_of_names,
     names_of,
 )
@@ -41,8 +39,8 @@ from neuros.simulators.mujoco.readings import Reading, Transforms
 from neuros.simulators.mujoco.sensor_base import (
     PICTURE,
     WORLD_FRAME,
+    Frame,
     Key,
-    Place,
     Sensor,
     SensorDeclaration,
     Vector,
@@ -58,7 +56,7 @@ _POINT_BYTES = 12
 
 @dataclass(frozen=True)
 class _OwnSensor:
-    """A sensor that the model declares: where its reading is, and the square of its ``noise``."""
+    """A sensor that the model declares: its slice of ``sensordata``, and ``noise`` squared."""
 
     start: int
     end: int
@@ -68,7 +66,7 @@ class _OwnSensor:
         return listed(data.sensordata[self.start : self.end])
 
 
-def _own_sensor(model: Any, sensor_type: Any, place: Place) -> _OwnSensor | None:
+def _own_sensor(model: Any, sensor_type: Any, place: Frame) -> _OwnSensor | None:
     """The model's first sensor of a type at a place that is measured in the world's frame."""
     for index in range(model.nsensor):
         if (
@@ -107,9 +105,10 @@ class _Touch:
         return total_force, total_torque
 
     def _contacts(self, data: Any) -> Iterator[tuple[int, int, npt.NDArray[np.float64]]]:
-        """Contact, sign, and force and torque (6,) in the contact's frame.
+        """The number of each contact, its sign, and force and torque (6,) in the contact's frame.
 
-        MuJoCo gives what the first geom does to the second, so it counts negatively for the first.
+        MuJoCo's force is the one that the first geom exerts on the second: its sign is -1 for the
+        first.
         """
         if not data.ncon:
             return
@@ -135,7 +134,7 @@ class Imu(Sensor):
     sorts = ("site", "body")
 
     def bind(self, problems: Problems) -> None:
-        self._place = place = Place(self.model, *self.elements[0])
+        self._place = place = Frame(self.model, *self.elements[0])
         kinds = mujoco.mjtSensor
         self._gyro = _own_sensor(self.model, kinds.mjSENS_GYRO, place)
         self._accelerometer = _own_sensor(self.model, kinds.mjSENS_ACCELEROMETER, place)
@@ -167,7 +166,7 @@ class Pose(Sensor):
     sorts = ("site", "body")
 
     def bind(self, problems: Problems) -> None:
-        self._place = Place(self.model, *self.elements[0])
+        self._place = Frame(self.model, *self.elements[0])
         self._is_stamped = self.declared.type.endswith("Stamped")
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
@@ -407,7 +406,7 @@ class Camera(Sensor):
         set_header(packet.header, time_ns, self.declared.elements[0])
         packet.width, packet.height, packet.step = width, height, 3 * width
         packet.encoding = "rgb8"
-        # rclpy checks lists and bytes element by element; an array is taken unchanged.
+        # rclpy checks lists and bytes element by element, but not arrays.
         pixels = array("B", (0,)) * (3 * width * height)
         image = np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
         self.cameras.render(data, self.elements[0][1], image)
@@ -439,14 +438,14 @@ SENSORS: Mapping[str, type[Sensor]] = {
 def read_sensors(node: Node, problems: Problems) -> tuple[SensorDeclaration, ...]:
     """The sensors that the outputs of ``node`` declare; faulty ones are left out and reported."""
     found = (
-        _declaration(port, f"{node.pointer}/outputs/{index}/mujoco", problems)
+        _sensor(port, f"{node.pointer}/outputs/{index}/mujoco", problems)
         for index, port in enumerate(node.outputs)
         if port.mujoco
     )
     return tuple(sensor for sensor in found if sensor)
 
 
-def _declaration(port: Port, pointer: str, problems: Problems) -> SensorDeclaration | None:
+def _sensor(port: Port, pointer: str, problems: Problems) -> SensorDeclaration | None:
     faults, name = Faults(pointer, problems), port.mujoco.get("sensor")
     sensor = SENSORS.get(name) if isinstance(name, str) else None
     if sensor is None:
@@ -455,8 +454,8 @@ def _declaration(port: Port, pointer: str, problems: Problems) -> SensorDeclarat
         return None
     faults.unknown_keys(port.mujoco, ("sensor", "element", "rate", *sensor.keys))
     if port.type not in sensor.types:
-        text = f"'{name}' fills {either(sensor.types)}, but output '{port.name}' is a {port.type}"
-        faults.add("sensor", text)
+        types = " or ".join(sensor.types)
+        faults.add("sensor", f"'{name}' fills {types}, but output '{port.name}' is a {port.type}")
     elements = _elements(port, sensor, faults)
     rate: Any = port.mujoco.get("rate")
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < float("inf"):
@@ -484,7 +483,7 @@ def _elements(port: Port, sensor: type[Sensor], faults: Faults) -> tuple[str, ..
     elif not is_list_of_names(value):
         faults.add("element", f"{value!r} is neither a name nor a list of names")
     elif port.type not in sensor.list_types:
-        hint = f"; a list needs {either(sensor.list_types)}" if sensor.list_types else ""
+        hint = f"; a list needs {' or '.join(sensor.list_types)}" if sensor.list_types else ""
         faults.add("element", f"a {port.type} holds one element only{hint}")
     else:
         return tuple(value)
@@ -502,28 +501,26 @@ def bind_sensors(
 
 
 def with_sensors(node_schema: Mapping[str, Any]) -> dict[str, Any]:
-    """The schema of node files with the sensors that there are."""
+    """The schema of node files, with all kinds of sensors."""
     part = dict(node_schema["$defs"]["mujoco_sensor"])
     properties = dict(part["properties"])
-    kinds = (f"{s.kind} ({' or '.join(s.types)}): {_summary(s)}" for s in SENSORS.values())
+    summaries = {kind: (each.__doc__ or "").splitlines()[0] for kind, each in SENSORS.items()}
+    kinds = (f"{s.kind} ({' or '.join(s.types)}): {summaries[s.kind]}" for s in SENSORS.values())
     properties["sensor"] = properties["sensor"] | {
         "description": " ".join(kinds),
         "enum": list(SENSORS),
     }
-    part |= {"properties": properties, "allOf": [_rule(sensor) for sensor in SENSORS.values()]}
+    rules = [_rule(sensor, summaries[kind]) for kind, sensor in SENSORS.items()]
+    part |= {"properties": properties, "allOf": rules}
     return {**node_schema, "$defs": {**node_schema["$defs"], "mujoco_sensor": part}}
 
 
-def _summary(sensor: type[Sensor]) -> str:
-    return (sensor.__doc__ or "").splitlines()[0]
-
-
-def _rule(sensor: type[Sensor]) -> dict[str, Any]:
-    """What the schema demands of a declaration of this kind."""
+def _rule(sensor: type[Sensor], summary: str) -> dict[str, Any]:
+    """The schema of declarations of this kind."""
     element: dict[str, Any] = {"type": ["string", "array"] if sensor.list_types else "string"}
     keys = dict.fromkeys(key for each in SENSORS.values() for key in each.keys)
     then: dict[str, Any] = {
-        "description": _summary(sensor),
+        "description": summary,
         "properties": {
             "element": element if sensor.sorts else {"not": {}},
             **{key: {"not": {}} for key in keys if key not in sensor.keys},

@@ -23,10 +23,10 @@ from neuros.simulators.mujoco.world import World
 
 _BOUT_S = 0.005
 _BOUT_STEPS = 20
-_PAUSE_LOOK_S = 0.1
+_IDLE_S = 0.1
 _REFRESH_S = 1 / 60
 _SPACE = 32
-_CLOSE_S = 4.0  # less than a node has to end; software OpenGL takes its time
+_CLOSE_S = 4.0  # shorter than a node's time to end; software OpenGL is slow to close
 
 
 class MuJoCo:
@@ -46,7 +46,7 @@ class MuJoCo:
         clock, wait: wall clock in seconds, and a sleep; for tests.
 
     Raises:
-        ModelError: everything that is wrong with the declarations and the model, by file and key.
+        ModelError: with every problem of the declarations and the model, by file and key.
     """
 
     def __init__(
@@ -67,11 +67,15 @@ class MuJoCo:
         self._viewer: Viewer | None = None
         if launch := find_launcher(node):
             self._viewer = Viewer(
-                launch, self.model, self.data, toggle=self._toggle_pause, closed=self.resume
+                launch,
+                self.model,
+                self.data,
+                toggle=self._toggle_pause,
+                closed=self.resume,
             )
         self._is_over = False
         node.own_simulated_time(lambda: self.sim_time)
-        node.show_world(self._view.look)
+        node.show_world(self._view.observe)
         node.on_close(self.close)
 
     # ---- what it is -------------------------------------------------------------------------
@@ -113,9 +117,23 @@ class MuJoCo:
             raise ModelError(f"step_synchronous: count is a whole number from 1, not {count!r}")
         self._refuse_while_running("step_synchronous")
         self._world.require_bound()
-        self._wait_while_paused()
-        self._refuse_to_cross(self._world.steps + count)
-        self._advance_to(self._world.steps + count)
+        # While the plugin waits here, only the user can resume, in the viewer.
+        if self._lock.is_paused and (self._viewer is None or not self._viewer.is_open):
+            raise ModelError("the simulation is paused: resume() it before it is stepped")
+        while not self._is_over and self._lock.is_paused:
+            self._sync_viewer()
+            self._lock.wait_resumed(_IDLE_S)
+        world = self._world
+        target = world.steps + count
+        if crossing := world.schedule.find_crossing(self._unread, world.steps, target):
+            output, first, second = crossing
+            when = world.time.seconds
+            raise ModelError(
+                f"{self._node.description.file}: sensor '{output}' would fire again at "
+                f"{when(second):g} s while its packet of {when(first):g} s is unread: call "
+                f"read('{output}') after each firing, every {second - first} steps"
+            )
+        self._advance_to(target)
 
     def step_to_next(self) -> None:
         """Advance to the next firing of any sensor."""
@@ -155,7 +173,7 @@ class MuJoCo:
             lambda: self._bout(steps),
             lambda: self.sim_time,
             lambda: self._world.cameras.close(),
-            None if self._viewer is None else self._look_at_viewer,
+            None if self._viewer is None else self._sync_viewer,
             real_time_factor,
             self._clock,
             self._wait,
@@ -245,7 +263,7 @@ class MuJoCo:
     # ---- inside -----------------------------------------------------------------------------
 
     def _set(self, controls: Callable[[], Controls]) -> None:
-        # Where the plugin steps, nothing else does meanwhile.
+        # Where the plugin steps, no other thread uses the data.
         with self.paused() if self.is_running else nullcontext():
             ctrl = self.data.ctrl
             for actuator, value in controls():
@@ -253,7 +271,7 @@ class MuJoCo:
 
     def _bout(self, steps: int) -> Mapping[str, Packet]:
         """Up to ``steps`` steps, ending at a firing; the packets that are due then."""
-        if not self._unread:  # packets that the plugin has left behind leave first
+        if not self._unread:  # packets that the plugin has not read are sent first
             world = self._world
             firing = world.schedule.next_firing(world.steps)
             target = world.steps + steps
@@ -272,37 +290,17 @@ class MuJoCo:
             if due:
                 self._unread.update(world.sense(due))
             if view.is_watched:
-                view.note()
+                view.record()
         view.is_stepping = False
         if self._viewer is not None:
             self._viewer.sync()
-
-    def _refuse_to_cross(self, target: int) -> None:
-        world = self._world
-        crossing = world.schedule.find_crossing(self._unread, world.steps, target)
-        if crossing is not None:
-            output, first, second = crossing
-            when = world.time.seconds
-            raise ModelError(
-                f"{self._node.description.file}: sensor '{output}' would fire again at "
-                f"{when(second):g} s while its packet of {when(first):g} s is unread: call "
-                f"read('{output}') after each firing, every {second - first} steps"
-            )
 
     def _refuse_while_running(self, what: str) -> None:
         if self.is_running:
             raise ModelError(f"{what} is for a simulation that the plugin steps: stop() it first")
 
-    def _wait_while_paused(self) -> None:
-        """Wait until the user resumes in the viewer, the only way while the plugin waits here."""
-        if self._lock.is_paused and (self._viewer is None or not self._viewer.is_open):
-            raise ModelError("the simulation is paused: resume() it before it is stepped")
-        while not self._is_over and self._lock.is_paused:
-            self._look_at_viewer()
-            self._lock.wait_resumed(_PAUSE_LOOK_S)
-
-    def _look_at_viewer(self) -> None:
-        """Notice, during a pause, that the user has closed the window."""
+    def _sync_viewer(self) -> None:
+        """Update the viewer, or notice that the user has closed it, during a pause."""
         with self.paused():
             if self._viewer is not None:
                 self._viewer.sync()
@@ -318,7 +316,7 @@ class Viewer:
     """MuJoCo's native window, passive: it shows the simulation, and can pause it.
 
     The space bar pauses and resumes; closing the window resumes for good. ``launch`` is
-    ``mujoco.viewer.launch_passive`` or something that looks like it.
+    ``mujoco.viewer.launch_passive`` or a function with its signature.
     """
 
     def __init__(
@@ -347,30 +345,29 @@ class Viewer:
         """Open the window for another model."""
         self.close()
         others = set(threading.enumerate())
-        self._handle = self._opened(model, data)
-        if self._handle is None:
-            self._closed()
-            return
-        fresh = set(threading.enumerate()) - others
-        # launch_passive draws in a thread that is named after its function.
-        self._threads = {thread for thread in fresh if "_launch_internal" in thread.name}
-
-    def _opened(self, model: Any, data: Any) -> Any:
-        """Its handle; ``None`` if the user closes it so early that launch_passive never returns."""
+        # launch_passive never returns if the user closes the window before it is up.
         opening: Future[Any] = Future()
+
+        def on_key(key: int) -> None:
+            if key == _SPACE:
+                self._toggle()
 
         def launch() -> None:
             try:
-                opening.set_result(self._launch(model, data, key_callback=self._on_key))
+                opening.set_result(self._launch(model, data, key_callback=on_key))
             except BaseException as error:
                 opening.set_exception(error)
 
         threading.Thread(target=launch, name="viewer", daemon=True).start()
         try:
-            return opening.result(self._opens_within_s)
+            self._handle = opening.result(self._opens_within_s)
         except TimeoutError:
             opening.add_done_callback(lambda late: late.result().close())
-            return None
+            self._closed()
+            return
+        fresh = set(threading.enumerate()) - others
+        # launch_passive draws in a thread that is named after its function.
+        self._threads = {thread for thread in fresh if "_launch_internal" in thread.name}
 
     def sync(self) -> None:
         """Show the present data, at most 60 times per wall second; not during a step."""
@@ -384,9 +381,9 @@ class Viewer:
             self._closed()
 
     def close(self) -> None:
-        """Close the window; returns when it is gone.
+        """Close the window and wait until it is gone.
 
-        GLFW is given up at the end of the process, and must not be while a window is still drawn.
+        GLFW ends with the process, and crashes if a window is still drawn then.
         """
         handle, self._handle = self._handle, None
         if handle is not None:
@@ -395,15 +392,11 @@ class Viewer:
             thread.join(_CLOSE_S)
         self._threads = set()
 
-    def _on_key(self, key: int) -> None:
-        if key == _SPACE:
-            self._toggle()
-
 
 def find_launcher(node: NodeContext) -> Callable[..., Any] | None:
-    """The function that opens a window if ``NEUROS_GUI`` asks for one; else ``None``.
+    """The function that opens a window, if ``NEUROS_GUI`` asks for one; else ``None``.
 
-    Where none can open, a warning says why.
+    Where no window can open, a warning says why.
     """
     wanted = node.description.environment.get("NEUROS_GUI", os.environ.get("NEUROS_GUI", ""))
     if wanted in ("", "0"):

@@ -18,21 +18,25 @@ _TIMESTEP_TOLERANCE = Fraction(1, 10_000_000)
 _PERIOD_TOLERANCE = Fraction(1, 1_000_000)
 _MAX_LAG_S = 0.5
 _JOIN_S = 5.0
-_LOOK_S = 0.1
+_IDLE_S = 0.1
 
 
 class Timebase:
     """Converts steps to time for one timestep, in seconds.
 
-    Whole nanoseconds are taken as written (``0.002`` is 1/500); a rounded ``0.0041666667`` is
-    taken as the 1/240 that it stands for.
+    A timestep in whole nanoseconds is exact as written (``0.002`` is 1/500); a rounded
+    ``0.0041666667`` means 1/240.
 
     Attributes:
-        timestep_s: the float next to that.
+        timestep_s: the float nearest to the exact timestep.
     """
 
     def __init__(self, timestep_s: float) -> None:
-        self._step = _as_fraction(timestep_s)
+        exact = Fraction(repr(float(timestep_s)))
+        if (exact * 1_000_000_000).denominator != 1:
+            near = exact.limit_denominator(_LARGEST_DENOMINATOR)
+            exact = near if abs(near - exact) <= exact * _TIMESTEP_TOLERANCE else exact
+        self._step = exact
         self._numerator, self._denominator = self._step.as_integer_ratio()
         self.timestep_s = float(self._step)
 
@@ -63,7 +67,7 @@ class Timebase:
 
 
 class Schedule:
-    """When which sensor fires: every ``periods[name]`` steps, the first time after one period."""
+    """The firings of sensors: every ``periods[name]`` steps, first after one period."""
 
     def __init__(self, periods: Mapping[str, int]) -> None:
         self._periods = dict(periods)
@@ -81,10 +85,10 @@ class Schedule:
     def find_crossing(
         self, unread: Collection[str], step: int, target: int
     ) -> tuple[str, int, int] | None:
-        """A sensor that a way from ``step`` to ``target`` would cost a packet.
+        """A sensor that would lose a packet between ``step`` and ``target``, or ``None``.
 
-        That is one with an unread packet that fires, or one that fires twice. Returns its name and
-        the steps of the two firings, or ``None``.
+        A sensor loses one if it fires while its packet is unread, or twice. Returns its name and
+        the steps of the two firings.
         """
         for name, period in self._periods.items():
             last = step - step % period
@@ -100,20 +104,12 @@ class Schedule:
         return iter(self._periods)
 
 
-def _as_fraction(timestep_s: float) -> Fraction:
-    exact = Fraction(repr(float(timestep_s)))
-    if (exact * 1_000_000_000).denominator == 1:
-        return exact
-    near = exact.limit_denominator(_LARGEST_DENOMINATOR)
-    return near if abs(near - exact) <= exact * _TIMESTEP_TOLERANCE else exact
-
-
 class Pacer:
     """Holds a simulation back to ``factor`` simulated seconds per wall second.
 
-    It measures against a fixed origin, so errors of single waits do not add up: after a late wait
-    the simulation catches up. What it is behind by more than ``max_lag_s`` it gives up for good,
-    so that it does not race after a long stall. ``factor`` ``None`` never waits.
+    Waits are measured against a fixed origin, so that their errors do not add up: after a late wait
+    the simulation catches up. A lag beyond ``max_lag_s`` is dropped, so that the simulation does
+    not race after a long stall. With ``factor`` ``None`` the pacer never waits.
     """
 
     def __init__(
@@ -127,16 +123,16 @@ class Pacer:
         self._origin: float | None = None
 
     def restart(self) -> None:
-        """Forget the past: the next call sets a new origin. For pauses and resets; any thread."""
+        """Set a new origin at the next call, after a pause or reset; from any thread."""
         self._origin = None
 
     def start(self, sim_time_s: float) -> None:
-        """Now is when ``sim_time_s`` should be."""
+        """Set the origin so that ``sim_time_s`` is due now."""
         if self._factor is not None:
             self._origin = self._clock() - sim_time_s / self._factor
 
     def hold(self, sim_time_s: float) -> None:
-        """Wait until ``sim_time_s`` may be."""
+        """Wait until ``sim_time_s`` is due."""
         if self._factor is None:
             return
         origin = self._origin  # read once: another thread may call restart
@@ -151,11 +147,10 @@ class Pacer:
 
 
 class StepLock:
-    """Lock of model and data: the stepping thread takes it bout by bout; visitors go first.
+    """Lock of model and data: the stepping thread holds it bout by bout, and visitors go first.
 
-    It also holds the pause, in which no step begins.
-
-    A plain lock would starve visitors: the stepping thread would take it again at once.
+    It also holds the pause, in which no step begins. A plain lock would starve visitors: the
+    stepping thread would acquire it again at once.
     """
 
     def __init__(self) -> None:
@@ -167,12 +162,11 @@ class StepLock:
 
     @property
     def is_paused(self) -> bool:
-        """Whether stepping is paused."""
         return self._is_paused
 
     @contextmanager
     def visit(self) -> Iterator[None]:
-        """No step runs inside; nests; visitors of other threads wait."""
+        """Exclude steps and other threads' visits; nests."""
         with self._one_visitor:
             with self._changed:
                 self._visitors += 1
@@ -185,7 +179,7 @@ class StepLock:
                     self._changed.notify_all()
 
     def pause(self) -> None:
-        """Let no step begin until :meth:`resume`; returns at once."""
+        """Keep further steps from beginning until :meth:`resume`; returns at once."""
         self._is_paused = True
 
     def resume(self) -> None:
@@ -194,7 +188,7 @@ class StepLock:
             self._changed.notify_all()
 
     def wake(self) -> None:
-        """Let every waiting thread check its condition again."""
+        """Make every waiting thread check its condition again."""
         with self._changed:
             self._changed.notify_all()
 
@@ -226,18 +220,19 @@ class StepLock:
 
 
 class FreeRun:
-    """From time 0 of the run on: a bout of steps, wait for the wall clock, send what is due.
+    """A thread that runs a bout of steps, waits for the wall clock, and sends due packets, in turn.
 
-    Handing over waits while a reliable connection is blocked, and stepping with it; model and data
-    are free for visitors of the lock meanwhile. An error ends the node. It ends by itself when the
-    simulated time of the run is over.
+    It begins at time 0 of the run, and ends when the simulated time of the run is over. Sending
+    waits while a reliable connection is blocked; visitors of the lock may use model and data
+    meanwhile. An error ends the node.
 
     Args:
         advance: runs one bout and returns the packets that are due after it, by output.
         sim_time: simulated seconds.
         finish: called in the thread at its end.
-        look: called now and then while stepping is paused, ``None`` for nothing.
-        clock: wall seconds; ``wait`` sleeps that many, by default until :meth:`stop` at the latest.
+        idle: called every 0.1 s while stepping is paused; ``None``: nothing.
+        clock: wall seconds.
+        wait: sleeps that many seconds; by default :meth:`stop` ends the sleep.
     """
 
     def __init__(
@@ -247,14 +242,14 @@ class FreeRun:
         advance: Callable[[], Mapping[str, Packet]],
         sim_time: Callable[[], float],
         finish: Callable[[], None],
-        look: Callable[[], None] | None,
+        idle: Callable[[], None] | None,
         factor: float | None,
         clock: Callable[[], float],
         wait: Callable[[float], object] | None = None,
     ) -> None:
         self._node, self._lock = node, lock
         self._advance, self._sim_time, self._finish = advance, sim_time, finish
-        self._look = look
+        self._idle = idle
         self._stopped = threading.Event()
         self.pacer = Pacer(factor, clock, wait or self._stopped.wait)
         self._thread = threading.Thread(
@@ -269,7 +264,7 @@ class FreeRun:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread; returns when it has ended. Harmless when it has, or from inside it."""
+        """End the thread and wait for its end; callable again, and in the thread itself."""
         self._stopped.set()
         self._lock.wake()
         if self._thread is not threading.current_thread():
@@ -290,11 +285,11 @@ class FreeRun:
 
     def _bout(self) -> bool:
         cancelled = self._stopped.is_set
-        while not self._lock.enter(cancelled, None if self._look is None else _LOOK_S):
+        while not self._lock.enter(cancelled, None if self._idle is None else _IDLE_S):
             if cancelled():
                 return False
-            if self._look is not None:
-                self._look()
+            if self._idle is not None:
+                self._idle()
         try:
             packets = self._advance()
         finally:

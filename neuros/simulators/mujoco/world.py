@@ -19,7 +19,7 @@ from neuros.registry import MODELS
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
 from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
 from neuros.simulators.mujoco.lookup import Problems, did_you_mean, has_any, names_of
-from neuros.simulators.mujoco.sensor_base import Sensor, SensorDeclaration
+from neuros.simulators.mujoco.sensor_base import Sensor
 from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
 from neuros.simulators.mujoco.timing import Schedule, Timebase
 
@@ -29,7 +29,10 @@ _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_B
 
 @dataclass(frozen=True)
 class _Bound:
-    """The declarations, bound to one model: all of them, or but for what is yet to be spawned."""
+    """The declarations, bound to one model.
+
+    ``is_complete`` is false while a declaration waits for an entity that may be spawned.
+    """
 
     sensors: Mapping[str, Sensor]
     commands: Mapping[str, Command]
@@ -37,7 +40,7 @@ class _Bound:
 
 
 class Declared:
-    """A compiled model with the sensors and commands of a node, as they are declared.
+    """A compiled model with the sensors and commands that a node file declares.
 
     Raises ``ModelError`` with every problem of the declarations and the model at once.
     """
@@ -54,34 +57,41 @@ class Declared:
         self._commands = read_commands(description, problems)
         try:
             self._spec, self.where = load()
-            _prepare_rendering(self._spec, self._sensors, fine=fine)
-            joints = _joints_of(self._spec)
-            add_drives(self._spec, joints, self._commands, problems)
-            self.model = _compile_spec(self._spec, self.where)
+            if cameras := [each for each in self._sensors if SENSORS[each.kind].is_rendered]:
+                # The off-screen buffer must be large enough for every camera.
+                buffer = self._spec.visual.global_
+                buffer.offwidth = max(buffer.offwidth, *(camera.width for camera in cameras))
+                buffer.offheight = max(buffer.offheight, *(camera.height for camera in cameras))
+                if not fine:
+                    self._spec.visual.quality.offsamples = 0
+            add_drives(self._spec, _joints_of(self._spec), self._commands, problems)
+            self.model = _compiled(self._spec.compile, self.where)
         except ModelError as error:
             problems.add_text(str(error))
             problems.raise_any()
         self.cameras = Cameras(self.model, fine=fine)
         self.time = Timebase(self.model.opt.timestep)
-        self.schedule = self._make_schedule(problems)
-        self._bound = self._bind(self.model, problems)
-        problems.raise_any()
-
-    def _make_schedule(self, problems: Problems) -> Schedule:
         periods = {}
         for sensor in self._sensors:
             try:
                 periods[sensor.output] = self.time.period_steps(sensor.rate_hz)
             except ValueError as error:
                 problems.add(f"{sensor.pointer}/rate", str(error))
-        return Schedule(periods)
+        self.schedule = Schedule(periods)
+        self._bound = self._bind(self.model, problems)
+        problems.raise_any()
 
     def _bind(self, model: Any, problems: Problems, *, may_wait: bool = True) -> _Bound:
         bodies = names_of(model, "body")
 
+        def may_be_spawned(element: str) -> bool:
+            parts = element.split("/")
+            entities = ("/".join(parts[:count]) for count in range(1, len(parts)))
+            return any(entity and not _is_taken(entity, bodies) for entity in entities)
+
         def can_be_bound(elements: Iterable[str]) -> bool:
             return not may_wait or all(
-                has_any(model, name) or not _may_come(name, bodies) for name in elements
+                has_any(model, name) or not may_be_spawned(name) for name in elements
             )
 
         sensors = [sensor for sensor in self._sensors if can_be_bound(sensor.elements)]
@@ -95,14 +105,14 @@ class Declared:
 
 
 class World(Declared):
-    """Physics in whole steps, without any notion of who steps it and when.
+    """Physics in whole steps; the caller decides when to step.
 
-    A sensor is read by ``mj_forward`` at the state of its firing time, so that what it measures
-    and its stamp belong together (right after ``mj_step`` MuJoCo's readings are one step old).
-    The physics is unchanged, bit for bit, with and without sensors.
+    A sensor is read by ``mj_forward`` at the state of its firing time, so that the reading and its
+    stamp belong together (right after ``mj_step`` MuJoCo's readings are one step old). The physics
+    is bit for bit the same with and without sensors.
 
-    A declaration that names an element called ``name/...``, which :meth:`spawn` may still bring, is
-    bound when it is there; :meth:`require_bound` says that nothing more comes.
+    A declaration that names an element ``name/...`` waits until :meth:`spawn` adds that element;
+    :meth:`require_bound` ends the waiting.
     """
 
     def __init__(self, node: NodeContext, model: Any, *, fine: bool) -> None:
@@ -111,7 +121,7 @@ class World(Declared):
         super().__init__(node.description, lambda: _load_spec(node, model), problems, fine=fine)
         self.data = mujoco.MjData(self.model)
         if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
-            import_opengl()  # what is missing is said now, and not at the first image
+            import_opengl()  # raises now, not at the first image
         self.steps = 0
         self._seen_warnings: set[int] = set()
         mujoco.mj_forward(self.model, self.data)
@@ -141,11 +151,11 @@ class World(Declared):
         mujoco.mj_step(self.model, self.data, nstep=count)
         self.steps += count
         if self.data.warning.number.any():
-            self._look_at_warnings(count)
+            self._report_warnings(count)
 
     def sense(self, outputs: Iterable[str]) -> dict[str, Packet]:
         """The packets of these sensors for the present state."""
-        # mj_forward is a new start for the solver; the next step must not notice it.
+        # mj_forward restarts the solver, which would change the next step.
         solution = self.data.qacc_warmstart.copy()
         mujoco.mj_forward(self.model, self.data)
         self.data.qacc_warmstart[:] = solution
@@ -172,28 +182,29 @@ class World(Declared):
         # First on a copy: a spec cannot go back once something that does not fit is attached.
         trial, problems = self._spec.copy(), Problems(self._node.description.file)
         self._attach(trial, child.copy(), position, name, problems)
-        self._bind(_compile_spec(trial, where), problems)
+        self._bind(_compiled(trial.compile, where), problems)
         problems.raise_any()
         self._attach(self._spec, child, position, name, problems)
-        # What is new comes last in the world.
+        # The new elements come last in the world.
         self._recompile(range(self.model.nbody), range(self.model.neq))
 
     def remove(self, name: str, *, may_unbind: bool) -> None:
         """Remove a spawned entity; everything else keeps its state.
 
-        ``may_unbind``: also if sensors or actuators are declared for it, which then wait for
-        another entity of that name.
+        With ``may_unbind`` sensors and actuators that are declared for the entity wait for another
+        one of that name; without it they are an error.
         """
         trial = self._spec.copy()
         frame = trial.frame(_frame_of(name))
         if frame is None:
             known = [each.name[:-1] for each in trial.frames if each.name.endswith("/")]
             raise ModelError(f"there is no spawned entity '{name}'{did_you_mean(name, known)}")
-        for number, each in enumerate(trial.equalities):  # to know them again
+        # The numbers of the constraints that stay are read from their names after the deletion.
+        for number, each in enumerate(trial.equalities):
             each.name = f"#{number}"
         trial.delete(frame)
         problems = Problems(self._node.description.file)
-        model = _compile_spec(trial, self.where)
+        model = _compiled(trial.compile, self.where)
         bound = self._bind(model, problems)
         problems.raise_any()
         if not (bound.is_complete or may_unbind):
@@ -206,10 +217,10 @@ class World(Declared):
         self._recompile(bodies, [int(model.equality(i).name[1:]) for i in range(model.neq)])
 
     def _recompile(self, bodies: Sequence[int], equalities: Sequence[int]) -> None:
-        """Compile the changed spec; bodies and constraints that are still there keep their state.
+        """Compile the changed spec; bodies and constraints that stay keep their state.
 
-        ``recompile`` keeps positions, velocities, activations, controls and time; the rest is kept
-        here. Elements keep their order.
+        ``recompile`` keeps positions, velocities, activations, controls and time, and the order of
+        elements. This method copies the other fields, of the rows ``bodies`` and ``equalities``.
         """
         old, before = self.model, self.data
         self.model, self.data = self._spec.recompile(old, before)
@@ -238,7 +249,8 @@ class World(Declared):
         spec.attach(child, prefix=f"{name}/", frame=frame)
         add_drives(spec, _joints_of(spec) - before, self._commands, problems)
 
-    def _look_at_warnings(self, count: int) -> None:
+    def _report_warnings(self, count: int) -> None:
+        """Log new warnings of MuJoCo; raise ``ModelError`` where the state has diverged."""
         for warning, number in enumerate(self.data.warning.number.tolist()):
             if not number:
                 continue
@@ -255,13 +267,6 @@ class World(Declared):
                 self._node.get_logger().warning(f"{self.where}: MuJoCo: {text}")
 
 
-def _may_come(element: str, bodies: Sequence[str]) -> bool:
-    """Whether an entity that is not there yet could bring an element of this name."""
-    parts = element.split("/")
-    entities = ("/".join(parts[:count]) for count in range(1, len(parts)))
-    return any(entity and not _is_taken(entity, bodies) for entity in entities)
-
-
 def _frame_of(entity: str) -> str:
     """The name of the frame that holds a spawned entity."""
     return f"{entity}/"
@@ -270,7 +275,7 @@ def _frame_of(entity: str) -> str:
 def _bodies_without(spec: Any, entity: str) -> list[int]:
     """The ids of all bodies that stay when an entity is removed.
 
-    A spec numbers them anew at once, so in a copy their names are their old numbers.
+    A spec numbers its bodies anew at a deletion, so the bodies of a copy are named by their number.
     """
     marked = spec.copy()
     for number, body in enumerate(marked.bodies):
@@ -285,18 +290,29 @@ def _is_taken(entity: str, bodies: Iterable[str]) -> bool:
 
 
 def _load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
-    """An ``MjSpec`` of our own, and what to call it in messages.
+    """A new ``MjSpec``, and its name in messages.
 
-    ``model`` is the path of an MJCF, URDF or SDF file, MJCF as text, or an ``MjSpec``, which is
-    copied. What of a URDF or SDF file has no counterpart in MuJoCo is logged as a warning.
+    ``model`` is the path of an MJCF, URDF or SDF file, also in a folder of Gazebo's variables,
+    MJCF as text, or an ``MjSpec``, which is copied. Parts of a URDF or SDF file without a
+    counterpart in MuJoCo are logged as a warning.
     """
+    description = node.description
     if isinstance(model, mujoco.MjSpec):
         return model.copy(), f"MjSpec '{model.modelname}'"
     if isinstance(model, str) and model.lstrip().startswith("<"):
-        return _from_text(node.description, model)
+        return _from_text(description, model)
     if isinstance(model, str | Path):
-        path = _resolve(node, str(model))
-        return _from_file(node.description, path, node.get_logger().warning), str(path)
+        try:
+            path = node.resolve_path(str(model))
+        except ModelError:
+            suffix, found = Path(model).suffix.lower()[1:], None
+            if suffix in MODELS:
+                environ = {**os.environ, **description.environment}
+                found = MODELS.load(suffix).find(str(model), description.plugin.parent, environ)
+            if found is None:
+                raise
+            path = found
+        return _from_file(description, path, node.get_logger().warning), str(path)
     raise ModelError(
         f"a model is the path of a file, MJCF as text, or a mujoco.MjSpec, "
         f"not a {type(model).__name__}"
@@ -304,9 +320,9 @@ def _load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
 
 
 def problems_of(description: Node, model: Path | str) -> list[tuple[str, str]]:
-    """What is wrong with a model, a file or MJCF as text, and with a node's declarations for it.
+    """The problems of a model (a file, or MJCF as text) and of a node's declarations for it.
 
-    Of each, the place in the node file, empty where it is of the model, and the text.
+    Each has its pointer into the node file, empty for a problem of the model, and a text.
     """
 
     def load() -> tuple[Any, str]:
@@ -320,32 +336,17 @@ def problems_of(description: Node, model: Path | str) -> list[tuple[str, str]]:
     return problems.found
 
 
-def _resolve(node: NodeContext, model: str) -> Path:
-    """The file, also if it lies in a folder that Gazebo's variables name."""
-    try:
-        return node.resolve_path(model)
-    except ModelError:
-        suffix, description = Path(model).suffix.lower()[1:], node.description
-        found = None
-        if suffix in MODELS:
-            environ = {**os.environ, **description.environment}
-            found = MODELS.load(suffix).find(model, description.plugin.parent, environ)
-        if found is None:
-            raise
-        return found
-
-
 def _from_text(description: Node, model: str) -> tuple[Any, str]:
     where = f"XML text in {description.plugin}"
-    return _parsed(lambda: mujoco.MjSpec.from_string(model), where), where
+    return _compiled(lambda: mujoco.MjSpec.from_string(model), where), where
 
 
 def _from_file(description: Node, path: Path, warn: Callable[[str], object]) -> Any:
     kind = path.suffix.lower()
     if kind == ".xml":
-        return _parsed(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
-    if kind == ".mjcf":  # MuJoCo goes by the name: it knows .xml only
-        spec = _parsed(lambda: mujoco.MjSpec.from_string(path.read_text("utf-8")), str(path))
+        return _compiled(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
+    if kind == ".mjcf":  # MuJoCo's from_file knows .xml only
+        spec = _compiled(lambda: mujoco.MjSpec.from_string(path.read_text("utf-8")), str(path))
         spec.modelfiledir = str(path.parent)
         return spec
     try:
@@ -363,27 +364,11 @@ def _from_file(description: Node, path: Path, warn: Callable[[str], object]) -> 
 
 
 def _joints_of(spec: Any) -> set[str]:
-    """The names of all joints."""
     return {joint.name for joint in spec.joints}
 
 
-def _compile_spec(spec: Any, where: str) -> Any:
-    """The ``MjModel``; raises ``ModelError`` that starts with ``where``."""
-    return _parsed(spec.compile, where)
-
-
-def _prepare_rendering(spec: Any, sensors: Iterable[SensorDeclaration], *, fine: bool) -> None:
-    """Make the off-screen buffer large enough for every camera, and cheap unless ``fine``."""
-    cameras = [sensor for sensor in sensors if SENSORS[sensor.kind].is_rendered]
-    buffer = spec.visual.global_
-    for camera in cameras:
-        buffer.offwidth = max(buffer.offwidth, camera.width)
-        buffer.offheight = max(buffer.offheight, camera.height)
-    if cameras and not fine:
-        spec.visual.quality.offsamples = 0
-
-
-def _parsed(parse: Any, where: str) -> Any:
+def _compiled(parse: Callable[[], Any], where: str) -> Any:
+    """The result of ``parse``; an error of MuJoCo becomes a ``ModelError`` about ``where``."""
     try:
         return parse()
     except (ValueError, RuntimeError, TypeError, mujoco.FatalError) as error:
