@@ -4,8 +4,8 @@
 - :mod:`~neuros.snn.nest`, around NEST: seeds and threads, exact steps, rates and spikes in, spikes
   out.
 
-NEST is imported when the first of the second kind is used. Times are in seconds and rates in hertz
-unless a name says otherwise (``_ms``, ``_ns``).
+The first call of the second module imports NEST. Times are in seconds and rates in hertz unless a
+name says otherwise (``_ms``, ``_ns``).
 """
 
 from neuros.snn.coding import (

@@ -1,10 +1,9 @@
 """Spikes of a population: from rates to spikes and back, and population codes.
 
-All of it works with NumPy alone. Times are absolute simulated seconds, so errors of steps do not
-add up. Coders give exact spike times, not bins: they lie in ``[start, start + duration)``, or, for
-:class:`RegularEncoder`, in ``(start, start + duration]``, and for any cutting of time into windows
-the train is that of one long window (for Poisson: in distribution). Filters are exact in time: they
-decay by ``exp(-dt / tau)`` for any step, so the lengths of steps change nothing but rounding.
+It needs NumPy alone. Times are absolute simulated seconds, so errors of steps do not add up. Coders
+give exact spike times: they lie in ``[start, start + duration)``, or for :class:`RegularEncoder` in
+``(start, start + duration]``, and cutting a window into several does not change the train (for
+Poisson: its distribution). Filters decay by ``exp(-dt / tau)``, exactly for any step.
 
 A stimulus ``x`` (an angle, a position, a speed) becomes rates by a tuning curve per neuron; rates
 or spikes become a direction by the population vector, or a position by the centre of mass.
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 ROUNDING_S = 1e-9
-"""By so much may a spike lie outside of its step: sums of floats of seconds are not exact."""
+"""Tolerance for spikes outside of their step: sums of floats of seconds are not exact."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +31,7 @@ class Spikes:
         neuron: index within the population, from 0, ``(k,)``.
         time_s: since simulated time zero, in seconds, ``(k,)``.
 
-    Coders give spikes in the order of time. NEST's recorder gives them in its own, by time slices.
+    Coders give spikes in the order of time, NEST's recorder by time slices.
     """
 
     neuron: Indices
@@ -49,20 +48,15 @@ class Spikes:
         return int(self.neuron.size)
 
     def in_order(self) -> Spikes:
-        """The same spikes, by time; of one time, by neuron."""
+        """The same spikes, ordered by time, then by neuron."""
         order = np.lexsort((self.neuron, self.time_s))
         return Spikes(self.neuron[order], self.time_s[order])
 
     def into(self, packet: Any, neurons: int) -> Any:
-        """Put the spikes into a ``neuros_msgs/msg/Spikes``, by time; returns that message.
+        """Write the spikes, ordered by time, into a ``neuros_msgs/msg/Spikes`` and return it.
 
-        Its header is the caller's: the stamp says until when these are all spikes.
-
-        Args:
-            neurons: size of the population.
-
-        Raises:
-            ValueError: if a spike is of none of these neurons.
+        The caller sets the header: its stamp is the end of the time that the spikes cover.
+        Raises ``ValueError`` if a spike's neuron is not below ``neurons``, the population's size.
         """
         spikes = self.in_order()
         packet.size = neurons
@@ -76,12 +70,12 @@ class Spikes:
         return cls(np.array(packet.senders, np.int64), np.array(packet.times, np.float64))
 
     def counts(self, neurons: int) -> Indices:
-        """How many of them each of so many neurons fired, ``(neurons,)``."""
+        """The number of spikes of each neuron, ``(neurons,)``."""
         return np.bincount(checked_indices(self, neurons), minlength=neurons)
 
 
 def checked_indices(spikes: Spikes, neurons: int) -> Indices:
-    """The indices of the neurons. Raises ``ValueError`` where the population has no such one."""
+    """The neuron indices. Raises ``ValueError`` for one that the population does not have."""
     index = spikes.neuron
     is_foreign = (index < 0) | (index >= neurons)
     if np.any(is_foreign):
@@ -122,7 +116,7 @@ def poisson_spikes(
     Args:
         rates_hz: one per neuron, ``(n,)``, 0 or more.
         duration_s: of the window, above 0.
-        rng: the source of randomness; ``numpy.random.default_rng(seed)`` makes one.
+        rng: the source of randomness.
         start_s: simulated time at which the window begins.
 
     Raises:
@@ -141,9 +135,9 @@ def poisson_spikes(
 class RegularEncoder:
     """Evenly spaced spikes: perfect (leakless) integrate-and-fire neurons driven by their rates.
 
-    ``d phase / dt = rate``; a spike when the phase reaches 1, which is then taken from it. What is
-    left over from one window is kept for the next, so that after any time the number of spikes
-    differs by less than one from the integral of the rate, and nothing is rounded to a time step.
+    ``d phase / dt = rate``; at phase 1 the neuron fires and the phase falls by 1. The phase carries
+    over to the next window, so that at any time the number of spikes differs by less than one from
+    the integral of the rate, and nothing is rounded to a time step.
 
     Args:
         neurons: how many.
@@ -160,7 +154,7 @@ class RegularEncoder:
 
     @property
     def phase(self) -> Floats:
-        """The part of a spike that each neuron has integrated so far, in ``[0, 1)``, ``(n,)``."""
+        """The phase of each neuron, in ``[0, 1)``, ``(n,)``."""
         return np.array(self._phase)
 
     def encode(self, rates_hz: object, duration_s: float, start_s: float = 0.0) -> Spikes:
@@ -180,15 +174,16 @@ class RegularEncoder:
 
 
 class _Clock:
-    """Simulated time up to which a filter has come."""
+    """The simulated time of a filter."""
 
     def __init__(self, start_s: float) -> None:
         self.now_s = start_s
 
     def advance(self, until_s: float, spikes: Spikes | None = None) -> float:
-        """Go on to ``until_s``; returns by how much. The spikes must lie in between, ends included.
+        """Set the time to ``until_s`` and return the elapsed seconds.
 
-        Recorders count the last time of a step in, coders the first one: both are right here.
+        Raises ``ValueError`` for spikes outside of that time. Both ends count as inside: recorders
+        include the end of a step, coders its start.
         """
         elapsed_s = until_s - self.now_s
         if not elapsed_s >= 0.0:
@@ -225,7 +220,7 @@ class WindowRate:
         self._kept = Spikes(np.zeros(0, dtype=np.int64), np.zeros(0))
 
     def update(self, spikes: Spikes, until_s: float) -> Floats:
-        """Take the spikes since the last call; the rates at ``until_s`` in Hz, ``(n,)``.
+        """The rates at ``until_s`` in Hz, ``(n,)``, given the spikes since the last call.
 
         Raises ``ValueError`` where time goes back or spikes lie outside of the step.
         """
@@ -259,7 +254,7 @@ class ExponentialRate:
         self._clock = _Clock(start_s)
 
     def update(self, spikes: Spikes, until_s: float) -> Floats:
-        """Take the spikes since the last call; the rates at ``until_s`` in Hz, ``(n,)``.
+        """The rates at ``until_s`` in Hz, ``(n,)``, given the spikes since the last call.
 
         Raises ``ValueError`` where time goes back or spikes lie outside of the step.
         """
@@ -292,8 +287,7 @@ class LeakyIntegrator:
         self._clock = _Clock(start_s)
 
     def update(self, value: object, until_s: float) -> Floats:
-        """The filtered value at ``until_s``, the input having been ``value`` since the last call.
-
+        """The filtered value at ``until_s``, for an input of ``value`` since the last call.
         Raises ``ValueError`` if time goes back or the shape is wrong.
         """
         target = np.asarray(value, dtype=np.float64)
@@ -317,8 +311,8 @@ class GaussianTuning:
         preferred: value of the stimulus at each neuron's peak, ``(n,)``.
         width: standard deviation of the curve, in units of the stimulus.
         peak_hz, base_hz: the highest and the lowest rate.
-        period: the stimulus repeats itself after this much (``2 * math.pi`` for an angle in
-            radians): differences are taken the short way round. ``None``: it does not.
+        period: of a periodic stimulus (``2 * math.pi`` for an angle in radians); differences
+            are the shorter way round. ``None``: not periodic.
 
     Raises:
         ValueError: ``width`` or ``period`` is not above 0, or not ``0 <= base_hz <= peak_hz``.
@@ -353,9 +347,9 @@ class CosineTuning:
 
     Args:
         preferred_rad: direction of each neuron's highest rate, ``(n,)``.
-        mean_hz: rate averaged over all directions, as long as nothing is cut off at 0.
-        depth_hz: by how much it goes up and down. Where it is above ``mean_hz`` rates are cut off
-            at 0, and the population vector of evenly spaced directions stays right.
+        mean_hz: rate averaged over all directions, if no rate is cut off at 0.
+        depth_hz: amplitude. Above ``mean_hz`` rates are cut off at 0; the population vector of
+            evenly spaced directions stays right.
 
     Source: Georgopoulos, Schwartz & Kettner, "Neuronal population coding of movement direction",
     *Science* 233, 1416 (1986).
@@ -380,8 +374,8 @@ class Direction:
     """A population vector.
 
     Attributes:
-        angle_rad: where it points, in ``(-pi, pi]``; ``nan`` where nothing fired or all cancels.
-        length: between 0 (activity all around) and 1 (all of it at one preferred direction).
+        angle_rad: its direction, in ``(-pi, pi]``; ``nan`` without activity, or if all cancels.
+        length: between 0 (activity all around) and 1 (all activity at one preferred direction).
     """
 
     angle_rad: float
@@ -393,7 +387,7 @@ class PopulationVector:
 
     ``sum(a_i * exp(1j * preferred_i)) / sum(a_i)``. Without bias if the preferred directions are
     evenly spaced and all tuning curves alike and symmetric; otherwise directions with many neurons
-    attract it.
+    are preferred.
 
     Args:
         preferred_rad: ``(n,)``.
@@ -406,7 +400,7 @@ class PopulationVector:
         self._phasors = np.exp(1j * np.asarray(preferred_rad, dtype=np.float64))
 
     def of_rates(self, rates_hz: object) -> Direction:
-        """From the rate (or the number of spikes, or any activity from 0 up) of each, ``(n,)``."""
+        """From the rate, number of spikes, or other activity from 0 up of each neuron, ``(n,)``."""
         rates = checked_rates(rates_hz, self._phasors.size)
         # Not with @: the last digit of a BLAS product depends on the kind of processor.
         return self._direction(complex((rates * self._phasors).sum()), float(rates.sum()))
@@ -418,7 +412,7 @@ class PopulationVector:
 
     @staticmethod
     def _direction(vector: complex, activity: float) -> Direction:
-        # What is left of vectors that cancel is rounding: it points nowhere.
+        # Vectors that cancel leave a rounding error, which has no direction.
         if abs(vector) <= 1e-12 * activity:
             return Direction(float("nan"), 0.0)
         return Direction(float(np.angle(vector)), abs(vector) / activity)
@@ -427,8 +421,8 @@ class PopulationVector:
 def centre_of_mass(rates_hz: object, preferred: Floats) -> float:
     """``sum(rate_i * preferred_i) / sum(rate_i)``, in units of the stimulus; ``nan`` without rates.
 
-    For a stimulus on a line. At the ends of the line it is pulled inwards, since the curves there
-    have neurons on one side only: let the preferred values go beyond by two widths.
+    For a stimulus on a line. Near the ends of the line the result is pulled inwards, since only one
+    side has neurons: let the preferred values go beyond by two widths.
 
     Source: Dayan & Abbott (2001), section 3.3: the maximum-likelihood estimate for Gaussian tuning
     curves that cover the line evenly and fire Poisson spikes.

@@ -1,10 +1,9 @@
 """NEST: its kernel, exact steps of simulated time, and devices for spikes in and out.
 
 There is one kernel per process, set up so that runs with one seed give equal spikes. Simulated time
-is a whole number of its steps, so that nothing drifts. Devices take the :class:`Stepper` of the
-network, to know the time and to be able to clear a recorder; neurons are counted from 0 in the
-order of the ``NodeCollection``. NEST is licensed under the GPL and is no part of NeuROS: it is
-imported with the first call.
+is a whole number of its steps, so it does not drift. Devices need the :class:`Stepper` of the
+network: for the time, and to clear a recorder. Neurons are counted from 0 in the order of the
+``NodeCollection``. NEST is licensed under the GPL and no part of NeuROS: the first call imports it.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ import numpy as np
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, NodeError
 from neuros.snn.coding import (
-    Floats,
     Indices,
     Spikes,
     checked_indices,
@@ -35,11 +33,11 @@ NS_PER_MS = 1_000_000
 
 
 def import_nest() -> ModuleType:
-    """NEST, quiet, with the number of OpenMP's threads fixed first.
+    """Import NEST, quiet, with a fixed number of OpenMP threads.
 
-    Without ``OMP_NUM_THREADS`` in the environment NEST crashes or hangs where one thread imports it
-    and another one simulates: it is set to 1 unless it is there. Import and simulate in one thread,
-    as hooks do.
+    Without ``OMP_NUM_THREADS`` NEST crashes or hangs where one thread imports it and another one
+    simulates: the variable is set to 1 unless it is there. Import and simulate in one thread, as
+    hooks do.
 
     Raises:
         EnvironmentFault: NEST is not installed in the node's Python.
@@ -60,28 +58,28 @@ def import_nest() -> ModuleType:
 
 
 def derive_seed(seed: int, *names: str | int) -> int:
-    """A seed of its own for a part of a run, 1 to 2**32 - 1: of a node, of a population, of noise.
+    """A seed, 1 to 2**32 - 1, for a part of a run: a node, a population, a source of noise.
 
-    ``derive_seed(seed, node.name)`` lets one number seed a whole project; no two nodes draw equal
-    numbers, in one run or in the next. Equal arguments give equal seeds on every machine.
+    ``derive_seed(seed, node.name)`` lets one number seed a whole project, with different numbers
+    for each node and each seed. Equal arguments give equal seeds on every machine.
 
     Source: ``numpy.random.SeedSequence`` mixes; after O'Neill, PCG, seed_seq_fe (2015).
     """
-    # Zeros at the end would be the same as none: a 1 ends it.
+    # SeedSequence ignores zeros at the end: a 1 keeps them apart.
     words = [seed, *(word for name in names for word in _words(name)), 1]
     state = np.random.SeedSequence(words).generate_state(1, np.uint32)
     return max(1, int(state[0]))
 
 
 def _words(name: str | int) -> list[int]:
-    """As integers; the leading one keeps 1 apart from "1", and "ab", "c" from "a", "bc"."""
+    """A name as integers; the first one keeps 1 apart from "1", and "ab", "c" from "a", "bc"."""
     if isinstance(name, int):
         return [0, name]
     return [1 + len(name.encode()), int.from_bytes(name.encode(), "little")]
 
 
 def threads_of_node() -> int:
-    """Number of cores that NeuROS has given this node: ``OMP_NUM_THREADS``, 1 without it.
+    """The number of cores of this node: ``OMP_NUM_THREADS``, 1 without it.
 
     A node with ``"affinity": [2, 3]`` has 2. See docs/placement.md.
     """
@@ -92,7 +90,7 @@ def threads_of_node() -> int:
 
 
 def reset_kernel(seed: int, *, resolution_ms: float = 0.1, threads: int = 1) -> ModuleType:
-    """An empty kernel; returns the module ``nest``. Everything that was in it is gone.
+    """Empty the kernel, and return the module ``nest``.
 
     The spikes are a function of the network, the steps (see :class:`Stepper`),
     ``seed`` **and** ``threads``: every *virtual process* (without MPI there are ``threads`` of
@@ -102,9 +100,9 @@ def reset_kernel(seed: int, *, resolution_ms: float = 0.1, threads: int = 1) -> 
     Args:
         seed: 1 to 2**32 - 1; :func:`derive_seed` makes one.
         resolution_ms: NEST's time step, in milliseconds.
-        threads: 1 keeps a run comparable on every machine. More want cores of the node's own:
-            ``affinity`` in the node file and ``threads=threads_of_node()``. Beyond the cores there
-            are it is up to ten times slower, which is warned of.
+        threads: 1 keeps a run comparable on every machine. More need cores of the node's own:
+            ``affinity`` in the node file and ``threads=threads_of_node()``. More threads than
+            cores are up to ten times slower, and cause a warning.
 
     Raises:
         EnvironmentFault: NEST is not installed.
@@ -134,15 +132,15 @@ class PartialDelayWarning(UserWarning):
 
 @dataclass(frozen=True)
 class StepGrid:
-    """Lengths that a step may have.
+    """The lengths that a step may have.
 
     Args:
         resolution_ns: the simulator's own step, in nanoseconds.
-        min_delay_ns: the shortest delay of the network, a whole number of resolutions: so often its
-            spikes are exchanged.
+        min_delay_ns: the shortest delay of the network, which is the period at which its spikes
+            are exchanged; a whole number of resolutions.
 
     Raises:
-        ValueError: the delay is not a whole number of resolutions, or one of them is not above 0.
+        ValueError: the delay is not a whole number of resolutions, or an argument is not above 0.
     """
 
     resolution_ns: int
@@ -157,9 +155,9 @@ class StepGrid:
             )
 
     def steps(self, duration_ns: int) -> int:
-        """So many resolutions make up a duration.
+        """The number of resolutions in a duration.
 
-        Raises ``ValueError``, with the nearest lengths that do, where that is no whole number.
+        Raises ``ValueError``, with the nearest possible lengths, if it is not whole.
         """
         steps, rest_ns = divmod(duration_ns, self.resolution_ns)
         if steps < 1 or rest_ns:
@@ -167,7 +165,7 @@ class StepGrid:
         return steps
 
     def partial_delay(self, duration_ns: int) -> str:
-        """The complaint about a step of no whole number of shortest delays; empty if it is one."""
+        """Why a step is not a whole number of shortest delays; empty if it is."""
         if duration_ns % self.min_delay_ns == 0:
             return ""
         return self._refusal(duration_ns, self.min_delay_ns, "the shortest delay")
@@ -184,7 +182,7 @@ class StepGrid:
 
 
 def nanoseconds(seconds: float) -> int:
-    """The whole nanoseconds nearest to a duration. Exact for every multiple of 1 ns up to 52 days.
+    """The whole nanoseconds nearest to a duration; exact for multiples of 1 ns up to 52 days.
 
     Raises ``ValueError`` where it is not finite.
     """
@@ -194,12 +192,12 @@ def nanoseconds(seconds: float) -> int:
 
 
 def nanoseconds_of_ms(milliseconds: float) -> int:
-    """The whole nanoseconds nearest to a duration in milliseconds, as NEST counts."""
+    """The whole nanoseconds nearest to a duration in milliseconds, NEST's unit."""
     return round(milliseconds * NS_PER_MS)
 
 
 class Stepper:
-    """Simulates the network that has been built, in steps of simulated time.
+    """Simulates the built network in steps of simulated time.
 
     ::
 
@@ -210,33 +208,32 @@ class Stepper:
             stepper.advance_to_ns(stamp_ns)
 
     Time is counted in whole steps of NEST's resolution, as integers, without drift. A step that is
-    no whole number of resolutions is an error, before anything is simulated.
+    not a whole number of resolutions is an error, raised before anything is simulated.
 
     **Steps and delays.** Spikes are exchanged once per shortest delay of the network
     (``min_delay``). Steps of whole delays give the spikes of one long step, bit for bit. A step
     that ends between two exchanges changes the order in which the sources of randomness draw their
-    numbers: the spikes are other ones, as right as those of another seed, but they then depend on
-    the steps. NEST says so once, on its console; here it is a
-    :class:`PartialDelayWarning`, or with ``strict`` an error.
+    numbers: the spikes are as right as those of another seed, but depend on the steps. NEST says so
+    once, on its console; here it is a :class:`PartialDelayWarning`, or with ``strict`` an error.
 
-    NEST stays prepared from step to step (``Prepare``, ``Run``, ``Run``, ...). What it refuses
-    meanwhile is possible with :meth:`clear` (recorders) and after :meth:`release` (create, connect,
-    ``Simulate``); the next step prepares it again, without a change of spikes.
+    NEST stays prepared from step to step (``Prepare``, ``Run``, ``Run``, ...). Changes that NEST
+    refuses meanwhile are possible by :meth:`clear` (recorders) and after :meth:`release` (create,
+    connect, ``Simulate``); the next step prepares NEST again, without a change of spikes.
 
     Args:
-        strict: refuse steps that are no whole number of ``min_delay``.
+        strict: refuse steps that are not a whole number of ``min_delay``.
     """
 
     resets: ClassVar[int] = 0
-    """Of the kernel: there is one per process."""
+    """Resets of the one kernel of this process."""
 
     def __init__(self, *, strict: bool = False) -> None:
         self._nest: ModuleType = import_nest()
         self._strict = strict
         self._resets = Stepper.resets
         self._is_prepared = self._is_closed = self._knows_delays = False
-        self._look_at_delays()
-        # Not from zero: the network may have been simulated before.
+        self._read_delays()
+        # The network may have been simulated before.
         time_ns = nanoseconds_of_ms(float(self._nest.biological_time))
         self._steps = round(time_ns / self._grid.resolution_ns)
 
@@ -248,12 +245,12 @@ class Stepper:
     @property
     def min_delay_ns(self) -> int:
         """The shortest delay of the network in nanoseconds."""
-        self._look_at_delays()
+        self._read_delays()
         return self._grid.min_delay_ns
 
     @property
     def steps(self) -> int:
-        """Resolutions that have been simulated."""
+        """Number of simulated resolutions."""
         return self._steps
 
     @property
@@ -267,7 +264,7 @@ class Stepper:
         return self.time_ns / NS_PER_S
 
     def advance_s(self, duration_s: float) -> None:
-        """Simulate so many seconds, rounded to a nanosecond. Errors as of :meth:`advance_ns`."""
+        """Simulate seconds, rounded to a nanosecond. Errors as of :meth:`advance_ns`."""
         self._advance(nanoseconds(duration_s))
 
     def advance_to_ns(self, time_ns: int) -> None:
@@ -275,11 +272,11 @@ class Stepper:
         self._advance(time_ns - self.time_ns)
 
     def advance_ns(self, duration_ns: int) -> None:
-        """Simulate so many nanoseconds.
+        """Simulate nanoseconds.
 
         Raises:
-            ValueError: that is no whole number of resolutions above 0, or, with ``strict``, of
-                ``min_delay``; or the stepper is closed. Nothing has been simulated then.
+            ValueError: the duration is not a whole number of resolutions above 0, or, with
+                ``strict``, of ``min_delay``; or the stepper is closed. Nothing was simulated then.
             NodeError: the kernel has been reset elsewhere.
         """
         self._advance(duration_ns)
@@ -288,7 +285,7 @@ class Stepper:
         self._check_kernel()
         if self._is_closed:
             raise ValueError("the stepper is closed")
-        self._look_at_delays()
+        self._read_delays()
         steps = self._grid.steps(duration_ns)
         partial = self._grid.partial_delay(duration_ns)
         if partial and self._strict:
@@ -305,17 +302,17 @@ class Stepper:
         self._steps += steps
 
     def release(self) -> None:
-        """Let the network be changed until the next step, which looks at its delays anew."""
+        """Let the network be changed until the next step, which reads its delays again."""
         self._clean_up()
         self._knows_delays = False
 
     def clear(self, recorder: Any) -> None:
-        """Forget what a ``spike_recorder`` or ``multimeter`` has recorded."""
+        """Delete the records of a ``spike_recorder`` or ``multimeter``."""
         self._clean_up()
         recorder.n_events = 0
 
     def close(self) -> None:
-        """Release the kernel for good. A kernel that was reset elsewhere is left alone."""
+        """Release the kernel for good; one that was reset elsewhere is left alone."""
         if not self._is_closed and self._resets == Stepper.resets:
             self._clean_up()
         self._is_closed = True
@@ -340,8 +337,8 @@ class Stepper:
             self._is_prepared = False
             self._nest.Cleanup()
 
-    def _look_at_delays(self) -> None:
-        # Once, and not at every step: asking NEST takes 0.1 ms.
+    def _read_delays(self) -> None:
+        # Only after a change of the network: asking NEST takes 0.1 ms.
         if not self._knows_delays:
             self._grid = StepGrid(
                 nanoseconds_of_ms(self._nest.resolution), nanoseconds_of_ms(self._nest.min_delay)
@@ -351,9 +348,9 @@ class Stepper:
 class RateInput:
     """Poisson spikes for every neuron, at rates that may change with every step.
 
-    One ``poisson_generator`` per neuron: each keeps a rate of its own. (One generator for several
-    neurons would give each of them other spikes of the same rate.) The generators draw from the
-    kernel's random numbers: see :func:`reset_kernel`.
+    One ``poisson_generator`` per neuron, each with its own rate. (One generator for several neurons
+    would give each of them other spikes of the same rate.) The generators draw from the kernel's
+    random numbers: see :func:`reset_kernel`.
 
     Args:
         neurons: ``NodeCollection`` that receives.
@@ -369,7 +366,7 @@ class RateInput:
         self._rates_hz = np.zeros(len(neurons))
 
     def set_rates(self, rates_hz: object) -> None:
-        """From the next step on, in Hz, ``(n,)``. What has not changed costs nothing.
+        """Set the rates from the next step on, in Hz, ``(n,)``. Unchanged rates cost nothing.
 
         Raises ``ValueError`` if the shape is wrong, or a rate is negative or not finite.
         """
@@ -381,7 +378,7 @@ class RateInput:
 
 
 class SpikeInput:
-    """Given spikes, such as those of a coder, for every neuron: a ``spike_generator`` each.
+    """Plays given spikes, such as those of a coder, to every neuron: a ``spike_generator`` each.
 
     Args:
         neurons: ``NodeCollection`` that receives.
@@ -400,15 +397,20 @@ class SpikeInput:
         self._loaded: Indices = np.zeros(0, dtype=np.int64)
 
     def play(self, spikes: Spikes) -> None:
-        """Fire these in the steps to come, in place of what was to be played before.
+        """Play spikes in the coming steps, in place of those not played yet.
 
-        Times are simulated seconds; each is moved to the end of the resolution step that it lies
-        in, at most one resolution later, and several of a neuron that fall on one step all count.
+        Times are simulated seconds; a spike moves to the end of its resolution step, at most one
+        resolution later, and several of a neuron in one step all count.
 
         Raises ``ValueError`` where a spike lies in the past, or the population has no such neuron.
         """
         index = checked_indices(spikes, len(self._generators))
-        steps = self._steps_of(spikes.time_s)
+        resolution_ns = self._stepper.resolution_ns
+        time_ns = np.round(spikes.time_s * NS_PER_S).astype(np.int64)
+        # Step k covers (k - 1, k]. A coder's window includes its start, which lies in the step
+        # before: a spike there moves to the next step.
+        steps = -(-time_ns // resolution_ns)
+        steps = np.where(time_ns == self._stepper.time_ns, self._stepper.steps + 1, steps)
         if steps.size and steps.min() <= self._stepper.steps:
             raise ValueError(
                 f"a spike at {float(spikes.time_s.min())!r} s: the network is at "
@@ -416,37 +418,27 @@ class SpikeInput:
             )
         firing = np.unique(index)
         changed = np.union1d(self._loaded, firing)
-        if changed.size:
-            trains = [self._train(steps[index == neuron]) for neuron in changed]
+        trains = []
+        for neuron in changed:
+            own, counts = np.unique(steps[index == neuron], return_counts=True)
+            times_ms = own * resolution_ns / NS_PER_MS
+            trains.append({"spike_times": times_ms, "spike_multiplicities": counts})
+        if trains:
             self._generators[changed].set(trains)
         self._loaded = firing
 
-    def _train(self, steps: Indices) -> dict[str, Any]:
-        """The parameters of one generator."""
-        own, multiplicities = np.unique(steps, return_counts=True)
-        times_ms = own * self._stepper.resolution_ns / NS_PER_MS
-        return {"spike_times": times_ms, "spike_multiplicities": multiplicities.astype(np.int64)}
-
-    def _steps_of(self, time_s: Floats) -> Indices:
-        """The step that each time lies in: (k - 1, k] is k, and the start of a step is in it."""
-        time_ns = np.round(time_s * NS_PER_S).astype(np.int64)
-        steps = -(-time_ns // self._stepper.resolution_ns)
-        # A coder's window holds its first moment: that is the first step after it.
-        return np.where(time_ns == self._stepper.time_ns, self._stepper.steps + 1, steps)
-
 
 class SpikeReader:
-    """The spikes of a population since the last look.
+    """The spikes of a population since the last :meth:`read`.
 
-    A ``spike_recorder`` that is cleared by each :meth:`read`: a read costs as much as there are new
-    spikes, and memory does not grow as long as one reads. (NEST itself gives all spikes since the
-    recorder was made, every time.)
+    Each read clears the ``spike_recorder``: it costs as much as there are new spikes, and memory
+    does not grow. (NEST itself returns all spikes since the recorder was made, every time.)
 
     Args:
         neurons: ``NodeCollection``.
         stepper: of the network.
-        delay_ms: of the recorder's connections. They count for ``min_delay``: where all delays of
-            the network are longer than 1 ms, say so here.
+        delay_ms: of the recorder's connections. They count for ``min_delay``: raise it where all
+            delays of the network are longer than 1 ms.
     """
 
     def __init__(self, neurons: Any, stepper: Stepper, delay_ms: float = 1.0) -> None:
@@ -460,10 +452,10 @@ class SpikeReader:
         self._ids = ids[self._order]
 
     def read(self) -> Spikes:
-        """The spikes since the last read, in the order in which NEST has recorded them."""
+        """The spikes since the last read, in the order of NEST's recorder."""
         events = self._recorder.events
         senders = np.asarray(events["senders"], dtype=np.int64)
-        # By whole nanoseconds: the times of NEST are milliseconds with rounding in the last digit.
+        # Rounded to nanoseconds: NEST's milliseconds have errors in the last digit.
         time_ns = np.round(np.asarray(events["times"], dtype=np.float64) * NS_PER_MS)
         if senders.size:
             self._stepper.clear(self._recorder)

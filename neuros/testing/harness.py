@@ -47,14 +47,14 @@ from neuros.transport.memory import MemoryHub
 from neuros.transport.messages import checked, copy_packet, message_class
 
 _MANY = 10_000
-"""Hook executions after which :meth:`PluginHarness.run` takes it that they will never end."""
+"""Hook executions after which :meth:`PluginHarness.run` assumes that they never end."""
 
 
 class Neighbours:
-    """All nodes around one node (:class:`neuros.ports.Inbox` of each).
+    """All nodes around the node under test (:class:`neuros.ports.Inbox` of each).
 
-    Towards the node they keep the rules of each connection: what it does not take yet waits here.
-    What it sends they start on at once, and so acknowledge, unless they are busy.
+    A packet waits here until its connection lets it through. Neighbours start on received packets
+    at once, and so acknowledge them, unless they are busy.
     """
 
     def __init__(self, file: NodeFile, hub: MemoryHub) -> None:
@@ -72,16 +72,16 @@ class Neighbours:
             hub.join(end, self, [c for c in self.incoming if c.source_node == end])
 
     def send(self, connection: Connection, packet: Any) -> None:
-        """Send a packet, or keep it until the connection lets it through."""
+        """Send a packet, or keep it until its connection lets it through."""
         self._waiting[connection].append(copy_packet(packet))
         self._send_waiting(connection)
 
     def unsent(self, connections: Sequence[Connection]) -> int:
-        """Packets that wait for the node to take earlier ones."""
+        """Number of packets that wait for the node to start on earlier ones."""
         return sum(len(self._waiting[connection]) for connection in connections)
 
     def start_on(self, connection: Connection, count: int | None) -> None:
-        """Let a busy receiver start on ``count`` packets, or on all that it has."""
+        """Let a busy receiver start on ``count`` packets, or with ``None`` on all it has."""
         started = self._started[connection]
         arrived = len(self.received[connection])
         position = arrived if count is None else min(arrived, started + count)
@@ -165,13 +165,13 @@ class PluginHarness:
     >>> harness.run()
     1
 
-    Where nothing else is said, each input has one lossless connection, from a node ``sender``, and
-    each output one to a node ``receiver``. A failing hook makes :meth:`run` raise ``HookError``.
-    Around hooks, environment variables, current folder and import path are the node's.
+    By default each input has one lossless connection, from a node ``sender``, and each output one
+    to a node ``receiver``. A failing hook makes :meth:`run` raise ``HookError``. Hooks run with the
+    node's environment variables, current folder and import path.
 
     Attributes:
-        log: what the node has logged; it goes to Python's ``logging`` as well (``neuros.<name>``).
-        shutdown_reason: what the plugin gave to ``node.shutdown``, ``None`` before.
+        log: the records of the node; Python's ``logging`` has them, too (``neuros.<name>``).
+        shutdown_reason: the argument of the plugin's ``node.shutdown``, ``None`` before.
 
     Args:
         plugin: the plugin file, or the name of an installed module.
@@ -227,7 +227,7 @@ class PluginHarness:
         workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
     ) -> PluginHarness:
-        """One node of a project, with the connections that it has there.
+        """A node of a project, with its connections in that project.
 
         Args:
             project: the project file, or a folder with a ``project.json``.
@@ -287,7 +287,11 @@ class PluginHarness:
         workspace: Path,
         run_folder: Path | None,
     ) -> None:
-        folder = _temporary_folder_of(self) if run_folder is None else run_folder.resolve()
+        if run_folder is None:
+            folder = Path(tempfile.mkdtemp(prefix="neuros-"))
+            weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        else:
+            folder = run_folder.resolve()
         messages = provide_messages(node, workspaces_of(project, workspace))
         folders = Folders(project, workspace, folder)
         file = NodeFile(node, connections, folders, messages=messages)
@@ -304,12 +308,12 @@ class PluginHarness:
         self._contexts = ContextSwitch()
         self._contexts.hide_from_nodes(file.folders.project)
         (file.folders.run / file.node.name).mkdir(parents=True, exist_ok=True)
-        with self._on_stage():
+        with self._in_context():
             self._runtime = NodeRuntime(
                 file,
                 bench,
                 self._contexts,
-                tell=self._listen,
+                tell=self._receive,
                 fail=self._fail,
                 log_file=None,
                 duration_sim_s=None,
@@ -321,20 +325,20 @@ class PluginHarness:
     # ------------------------------------------------------------------ steps
 
     def run(self, executions: int | None = None) -> int:
-        """Run hooks until none is ready, or until so many have run; returns how many have.
+        """Run hooks until none is ready, or until ``executions`` have run; returns how many have.
 
         Raises:
-            HookError: if one fails; again at every later call.
-            NodeError: if they go on for ever and ``executions`` was not given.
+            HookError: a hook fails; every later call raises the error again.
+            NodeError: hooks go on for ever and ``executions`` was not given.
         """
         before, limit = self._executions(), _MANY if executions is None else executions
-        with self._on_stage():
+        with self._in_context():
             while self._executions() - before < limit and self._loop.step():
                 self._raise_failure()
         self._raise_failure()
         ran = self._executions() - before
         if executions is None and ran >= _MANY:
-            last = self._engine.hooks()[-1].name  # they are in the order of their execution
+            last = self._engine.hooks()[-1].name  # ordered by execution
             raise NodeError(
                 f"hooks have run {ran} times with no end, the last of them '{last}': one that"
                 " requires no input runs without pause; use run(executions=...), or block an output"
@@ -342,7 +346,7 @@ class PluginHarness:
         return ran
 
     def advance(self, seconds: float) -> int:
-        """Let time pass: run what is ready, then each tick at its time; returns how many ran.
+        """Advance the clock: run ready hooks, then each tick at its time; returns how many ran.
 
         Raises:
             HookError, NodeError: as :meth:`run`.
@@ -351,7 +355,7 @@ class PluginHarness:
         end_ns = self._clock.now_ns + round(seconds * 1e9)
         self.run()
         while (due_ns := self._loop.next_due_ns) is not None and due_ns <= end_ns:
-            with self._on_stage():
+            with self._in_context():
                 self._loop.advance_to(due_ns)
             self.run()
         self._loop.advance_to(end_ns)
@@ -361,12 +365,12 @@ class PluginHarness:
         """End the node: run its finalise hooks; a second call has no effect.
 
         Raises:
-            HookError: if one of them fails.
+            HookError: a finalise hook fails.
         """
         if self._is_final:
             return
         self._is_final, failure = True, self._failure
-        with self._on_stage():
+        with self._in_context():
             self._runtime.finalise()
         if failure is None:
             self._raise_failure()
@@ -390,7 +394,7 @@ class PluginHarness:
 
     @property
     def time_s(self) -> float:
-        """Seconds that have passed by :meth:`advance`."""
+        """Seconds advanced by :meth:`advance`."""
         return self._clock.now_ns / 1e9
 
     @property
@@ -400,7 +404,7 @@ class PluginHarness:
 
     @property
     def executions(self) -> dict[str, int]:
-        """How often each hook has run."""
+        """Number of executions of each hook."""
         hooks = snapshot(self._engine, self._clock())["hooks"]
         return {name: entry["executions"] for name, entry in hooks.items()}
 
@@ -425,16 +429,16 @@ class PluginHarness:
         return message_class(self._port(port, "port", self._inputs | self._outputs).type)()
 
     def send(self, input_name: str, *packets: Any, source: str | None = None) -> None:
-        """Send packets to an input; those that its connection does not let through yet wait.
+        """Send packets to an input; packets that its connection does not let through yet wait.
 
-        They arrive when :meth:`run` is called, as they are now: changing them later has no effect.
+        They are copied now, and arrive at the next :meth:`run`.
 
         Args:
-            source: which connection, ``"camera"`` or ``"camera.image"``, where there are several.
+            source: the connection, ``"camera"`` or ``"camera.image"``, where there are several.
 
         Raises:
-            TypeError, ValueError: if one is of another type, or holds a value that no node may
-                send; none of them is sent then.
+            TypeError, ValueError: a packet has another type, or a value that no node may send;
+                none of the packets is sent then.
         """
         port = self._port(input_name, "input", self._inputs)
         packets = tuple(checked(port, packet) for packet in packets)
@@ -450,17 +454,17 @@ class PluginHarness:
             self._ends.send(connections[0], packet)
 
     def unsent(self, input_name: str, source: str | None = None) -> int:
-        """Packets that still wait at their sender, since the node has not taken earlier ones."""
+        """Number of packets that wait at their sender until the node starts on earlier ones."""
         self._port(input_name, "input", self._inputs)
         return self._ends.unsent(self._from(input_name, source))
 
     # ------------------------------------------------------------------ what comes out
 
     def received(self, output: str, receiver: str | None = None) -> list[Any]:
-        """What has arrived from an output so far, oldest first.
+        """The packets of an output so far, oldest first.
 
         Args:
-            receiver: who received it, ``"viewer"`` or ``"viewer.image"``; all receive the same.
+            receiver: ``"viewer"`` or ``"viewer.image"``; all receivers get the same packets.
         """
         port = self._port(output, "output", self._outputs)
         if port.external_topic is not None:
@@ -468,16 +472,16 @@ class PluginHarness:
         return list(self._ends.received[self._to(output, receiver)[0]])
 
     def block(self, output: str, receiver: str | None = None) -> None:
-        """Let receivers of an output be busy: they start on no packet from now on."""
+        """Make receivers of an output busy: they start on no further packet."""
         self._ends.busy.update(self._to(output, receiver))
 
     def acknowledge(self, output: str, count: int | None = 1, receiver: str | None = None) -> None:
-        """Let busy receivers start on ``count`` packets, ``None``: on all; they stay busy."""
+        """Let busy receivers start on ``count`` packets (``None``: all); they stay busy."""
         for connection in self._to(output, receiver):
             self._ends.start_on(connection, count)
 
     def unblock(self, output: str, receiver: str | None = None) -> None:
-        """Let receivers start on all that they have, and on each packet as it comes."""
+        """Let receivers start on all packets they have, and on each new one at once."""
         self._ends.busy.difference_update(self._to(output, receiver))
         self.acknowledge(output, None, receiver)
 
@@ -491,7 +495,7 @@ class PluginHarness:
     def _executions(self) -> int:
         return sum(hook.executions for hook in self._engine.all_hooks)
 
-    def _listen(self, message: Message) -> None:
+    def _receive(self, message: Message) -> None:
         if isinstance(message, Shutdown) and self.shutdown_reason is None:
             self.shutdown_reason = message.reason
 
@@ -504,8 +508,8 @@ class PluginHarness:
             raise self._failure
 
     @contextlib.contextmanager
-    def _on_stage(self) -> Iterator[None]:
-        """The context of the node for a while; that of the test again afterwards."""
+    def _in_context(self) -> Iterator[None]:
+        """Switch to the context of the node, and back to that of the test."""
         folder = os.getcwd()
         os.chdir(self._file.folders.run)
         try:
@@ -554,20 +558,13 @@ def _with_environment(node: Node, environment: Mapping[str, str] | None) -> Node
     return replace(node, environment={**node.environment, **(environment or {})})
 
 
-def _temporary_folder_of(owner: object) -> Path:
-    """A folder that goes when ``owner`` does."""
-    folder = Path(tempfile.mkdtemp(prefix="neuros-"))
-    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
-    return folder
-
-
 def workspaces_of(project: Path, workspace: Path) -> Workspaces:
-    """What a project in this folder sees besides the packages of ROS."""
+    """The workspaces of a project in this folder, besides the packages of ROS."""
     return Workspaces(project.resolve() / "workspace", workspace, os.environ)
 
 
 def provide_messages(node: Node, workspaces: Workspaces) -> tuple[Path, ...]:
-    """Build what a node needs; returns where Python finds it from now on.
+    """Build the messages of a node and put them on ``sys.path``; returns their folders.
 
     Raises:
         ProjectError: with all mistakes in message files.

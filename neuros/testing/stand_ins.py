@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -40,10 +40,10 @@ class ManualClock:
 
 
 class StepLoop:
-    """Handles events in the order in which they were posted (:class:`neuros.ports.EventLoop`).
+    """Handles events in the order of posting (:class:`neuros.ports.EventLoop`).
 
-    All packets travel through this one queue, so a loop-back needs no queue of its own to come
-    after everything that waits.
+    All packets go through this one queue, so a loop-back arrives after all waiting events without a
+    queue of its own.
     """
 
     has_taken_in = True
@@ -56,17 +56,16 @@ class StepLoop:
 
     @property
     def has_waiting_events(self) -> bool:
-        """Whether events wait."""
         return bool(self._events)
 
     def post(self, event: Event) -> None:
-        """Handle ``event`` after all that already wait. Any thread."""
+        """Handle ``event`` after all waiting events; callable from any thread."""
         self._events.append(event)
 
     post_loop_back = post_from_thread = post
 
     def note_execution(self) -> None:
-        """Nothing has arrived meanwhile."""
+        """Nothing arrives during an execution."""
 
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
         """Call ``on_due`` when :meth:`advance_to` reaches ``next_due_ns()``."""
@@ -74,12 +73,12 @@ class StepLoop:
 
     @property
     def next_due_ns(self) -> int | None:
-        """When the next timer is due, ``None`` if none is."""
+        """The time of the next timer, or ``None``."""
         dues = [due for next_due_ns, _ in self._timers if (due := next_due_ns()) is not None]
         return min(dues, default=None)
 
     def advance_to(self, time_ns: int) -> None:
-        """Set the clock, and run the timers that are due then."""
+        """Set the clock, and run the timers that are due."""
         self._clock.now_ns = time_ns
         for next_due_ns, on_due in self._timers:
             due_ns = next_due_ns()
@@ -104,16 +103,16 @@ class StepLoop:
 
 
 class Record(NamedTuple):
-    """One line that a node has logged; ``severity`` is DEBUG, INFO, WARN, ERROR or FATAL."""
+    """A line of a node's log; ``severity`` is DEBUG, INFO, WARN, ERROR or FATAL."""
 
     severity: str
     text: str
 
 
 class RecordingLogger:
-    """Looks like rclpy's logger. Every record is kept, and passed on to Python's ``logging``.
+    """A stand-in for rclpy's logger that keeps every record, and passes it on to ``logging``.
 
-    ``once``, ``skip_first`` and ``throttle_duration_sec`` are accepted and leave nothing out.
+    ``once``, ``skip_first`` and ``throttle_duration_sec`` are accepted and have no effect.
     """
 
     def __init__(self, name: str, records: list[Record]) -> None:
@@ -122,7 +121,7 @@ class RecordingLogger:
         self._python = logging.getLogger(f"neuros.{name}")
 
     def get_child(self, name: str) -> RecordingLogger:
-        """A logger below this one; it keeps its records in the same list."""
+        """A child logger with the same list of records."""
         return RecordingLogger(f"{self.name}.{name}", self._records)
 
     def debug(self, message: str, **_: Any) -> bool:
@@ -149,10 +148,10 @@ class RecordingLogger:
 
 
 class RosNodeStandIn:
-    """What ``node.get_ros_node()`` gives in a test: name, logger and parameters, and no ROS.
+    """The result of ``node.get_ros_node()`` in a test: name, logger and parameters, without ROS.
 
     Args:
-        topics: of the node's own ports, by name: their type, how many publish, how many listen.
+        topics: by name of the node's topics: type, number of publishers, number of subscribers.
     """
 
     def __init__(
@@ -169,7 +168,6 @@ class RosNodeStandIn:
         self._logger = RecordingLogger(name, records)
 
     def get_name(self) -> str:
-        """The node's name."""
         return self._name
 
     def get_logger(self) -> RecordingLogger:
@@ -181,15 +179,13 @@ class RosNodeStandIn:
         return [(name, [topic[0]]) for name, topic in sorted(self._topics.items())]
 
     def count_publishers(self, name: str) -> int:
-        """How many publish there: the node, or the test."""
+        """The number of publishers: the node, or the test."""
         return self._topics[name][1]
 
     def count_subscribers(self, name: str) -> int:
-        """How many listen there."""
         return self._topics[name][2]
 
     def has_parameter(self, name: str) -> bool:
-        """Whether the project, or the plugin, has declared it."""
         return name in self._parameters
 
     def get_parameter(self, name: str) -> Parameter:
@@ -199,13 +195,13 @@ class RosNodeStandIn:
         return Parameter(name, value=self._parameters[name])
 
     def declare_parameter(self, name: str, value: Any = None, *_: Any, **__: Any) -> Parameter:
-        """As in rclpy; where the project gives a value, that one counts."""
+        """Declare a parameter as in rclpy; a value of the project wins."""
         if name not in self._given:
             self._parameters[name] = value
         return self.get_parameter(name)
 
     def __getattr__(self, attribute: str) -> Any:
-        if attribute.startswith("__"):  # what copy, pickle and the like ask for
+        if attribute.startswith("__"):  # copy and pickle look for such attributes
             raise AttributeError(attribute)
         raise NodeError(
             f"get_ros_node().{attribute}: there is no ROS behind a PluginHarness, only"
@@ -214,7 +210,7 @@ class RosNodeStandIn:
 
 
 class Topics:
-    """External topics in a test (``GraphBridge`` of a transport): what is published is kept."""
+    """External topics in a test (``GraphBridge`` of a transport); published packets are kept."""
 
     heard: tuple[Connection, ...] = ()
 
@@ -223,11 +219,11 @@ class Topics:
         self.published: dict[str, list[Any]] = {}
 
     def open(self, inbox: Inbox) -> None:
-        """Remember who takes what is sent on external topics."""
+        """Deliver to this inbox."""
         self.inbox = inbox
 
     def deliver(self, port: Port, packet: Any) -> None:
-        """Let a packet arrive on the external topic of an input."""
+        """Deliver a packet to the input of an external topic."""
         if self.inbox is not None:
             self.inbox.on_external_packet(port, packet)
 
@@ -236,10 +232,10 @@ class Topics:
         self.published.setdefault(port.name, []).append(copy_packet(packet))
 
     def show(self, connections: Sequence[Connection], packet: Any) -> None:
-        """There are no other listeners."""
+        """The test has no ROS tools that subscribe."""
 
     def close(self) -> None:
-        """Take nothing any more."""
+        """Drop further packets."""
         self.inbox = None
 
 
@@ -255,22 +251,22 @@ class Workbench(WithoutPeers):
         self._ros_nodes: dict[str, RosNodeStandIn] = {}
 
     def transport(self, file: NodeFile) -> Transport:
-        """The real transport of nodes that share a process."""
+        """The transport of nodes that share a process, as in runs."""
         self._ros_nodes[file.node.name] = RosNodeStandIn(
             file.node.name, self._log, file.node.parameters, _topics_of(file)
         )
         return MemoryTransport(file, self.hub, self.topics)
 
     def ros_node(self, file: NodeFile) -> RosNodeStandIn:
-        """A stand-in."""
+        """The node's stand-in."""
         return self._ros_nodes[file.node.name]
 
     def close(self) -> None:
-        """Nothing to give up."""
+        """There is nothing to release."""
 
 
 def _topics_of(file: NodeFile) -> dict[str, tuple[str, int, int]]:
-    """The topics of a node's ports, as they would be on the ROS graph."""
+    """The topics of a node's ports, as on the ROS graph."""
     node = file.node
     found = {}
     for c in file.connections:
@@ -308,7 +304,7 @@ def wire(text: str, discard_limit: int | None = None, queue_size: int = 1) -> Co
 
 
 def ports(types: Mapping[str, str]) -> tuple[Port, ...]:
-    """Ports from their names and message types, either notation."""
+    """Ports from their names and message types, in either notation."""
     found = []
     for name, written in types.items():
         type_name = normalised(written)
@@ -320,8 +316,11 @@ def ports(types: Mapping[str, str]) -> tuple[Port, ...]:
     return tuple(found)
 
 
-def _check_ends(node: Node, connections: Iterable[Connection]) -> None:
-    """Raise ``ValueError`` for a connection that does not fit the node."""
+def with_neighbours(node: Node, connections: Sequence[Connection]) -> tuple[Connection, ...]:
+    """Add a lossless connection for each port that has none: from ``sender``, to ``receiver``.
+
+    Raises ``ValueError`` for a given connection that does not fit the node.
+    """
     inputs, outputs = {p.name for p in node.inputs}, {p.name for p in node.outputs}
     for each in connections:
         if node.name not in (each.source_node, each.destination_node):
@@ -332,14 +331,6 @@ def _check_ends(node: Node, connections: Iterable[Connection]) -> None:
         ):
             if end == node.name and port not in known:
                 raise ValueError(f"{each}: node '{node.name}' has no {side} '{port}'")
-
-
-def with_neighbours(node: Node, connections: Sequence[Connection]) -> tuple[Connection, ...]:
-    """Add a lossless connection for each port that has none: from ``sender``, to ``receiver``.
-
-    Raises ``ValueError`` for a given connection that does not fit the node.
-    """
-    _check_ends(node, connections)
     taken = {c.destination_input for c in connections if c.destination_node == node.name}
     given = {c.source_output for c in connections if c.source_node == node.name}
     added = [
@@ -355,7 +346,7 @@ def with_neighbours(node: Node, connections: Sequence[Connection]) -> tuple[Conn
 
 
 def with_observer(node: Node, connections: Sequence[Connection]) -> tuple[Connection, ...]:
-    """Let outputs that no other node receives be seen, too, by one that never blocks them."""
+    """Add a best-effort receiver, which never blocks, for each output without one."""
     seen = {
         c.source_output
         for c in connections

@@ -15,11 +15,11 @@
     def show(node, pose):
         node.get_user_data().plot("truth", pose.pose.orientation, stamp_s(pose))
 
-A hook never waits for Matplotlib, which is not imported here: a message goes into a socket as far
-as that takes it, the rest with the next one. What the drawing process cannot take is kept, and left
-out and counted at last. With a display there is a window; in any case the figure is saved in the
-node's folder of the run, every ten seconds and at the end. A figure that knows its ``node`` is
-saved then however busy the machine is.
+A hook never waits for Matplotlib, which is not imported here: messages go into a socket without
+blocking, and wait where it is full. Beyond 4 MiB of waiting messages further ones are left out and
+counted. With a display there is a window; in any case the figure is saved in the node's folder of
+the run, every ten seconds and at the end. The end of a node waits for figures that know their
+``node``, on a busy machine, too.
 """
 
 from __future__ import annotations
@@ -57,20 +57,20 @@ __all__ = [
 
 _LARGEST_SIDE = 320
 _CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1}
-_LONGEST_STEM = 60  # characters, of up to four bytes: a name may have 255
+_LONGEST_STEM = 60  # characters, of up to four bytes: a file name may have 255 bytes
 _MOST_UNSENT_BYTES = 1 << 22
 _NICENESS = 5
 _PATIENCE_S = 60.0
-_TELL_S = 1.0
-# A process has 5 s to end, on a busy machine, too, and leaves ROS meanwhile.
+_PROGRESS_S = 1.0
+# A process has 5 s to end, also on a busy machine, and leaves ROS meanwhile.
 _PATIENCE_AT_END_S = 2.0
 _LENGTH = struct.Struct("!I")
-# The program needs no ROS: it must not start a second time to find its libraries.
+# The program needs no ROS: ros-wheels must not restart it to find ROS's libraries.
 _ENVIRONMENT = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
 
 
 class _Node(Protocol):
-    """The ``node`` that hooks receive, as far as figures need it."""
+    """The part of the hooks' ``node`` that figures need."""
 
     def on_close(self, callback: Callable[[], None]) -> None: ...
 
@@ -78,18 +78,18 @@ class _Node(Protocol):
 
 
 class _Feed:
-    """The drawing process of one figure, and the way to it.
+    """The drawing process of one figure, and the socket to it.
 
     Args:
         first: the first message.
-        file: where the figure is saved.
-        node: the figure is closed when it ends; ``None``: when the process does.
+        file: the figure's file.
+        node: its end closes the figure; ``None``: the end of the process does.
 
     Attributes:
-        dropped: messages that were left out.
+        dropped: number of messages that were left out.
 
     Raises:
-        EnvironmentFault: if it cannot be started.
+        EnvironmentFault: the process cannot be started.
     """
 
     def __init__(self, first: Sequence[Any], file: Path, node: _Node | None) -> None:
@@ -113,7 +113,7 @@ class _Feed:
             raise EnvironmentFault(f"the drawing process cannot be started: {error}") from error
         finally:
             far_end.close()
-        with contextlib.suppress(OSError):  # the node comes first
+        with contextlib.suppress(OSError):  # drawing must not slow the node down
             os.setpriority(os.PRIO_PROCESS, self._process.pid, _NICENESS)
         _OPEN.append(self)
         if node is not None:
@@ -121,7 +121,7 @@ class _Feed:
         self.send(first)
 
     def send(self, message: Sequence[Any]) -> None:
-        """Have something drawn, or leave it out."""
+        """Send a message to be drawn, or drop it while too much is unsent."""
         self._flush()
         if self._is_gone or len(self._unsent) > _MOST_UNSENT_BYTES:
             self.dropped += 1
@@ -130,43 +130,43 @@ class _Feed:
         self._flush()
 
     def send_latest(self, name: str, message: Sequence[Any]) -> None:
-        """Have something drawn in the place of what was to be drawn under that name before."""
+        """Send a message in place of an unsent one of the same name."""
         self.dropped += self._is_gone or name in self._latest
         self._latest[name] = message
         self._flush()
 
     def close(self) -> None:
-        """Let it draw the rest, save and end; wait for that some seconds. May be called again."""
+        """Let the process draw the rest, save and end, and wait for that; idempotent."""
         _close([self], _PATIENCE_S)
 
-    def hang_up(self, deadline_s: float) -> None:
-        """Send the rest, and say that there will be no more."""
+    def send_rest(self, deadline_s: float) -> None:
+        """Send all waiting messages, and end the stream."""
         while self._has_more and time.monotonic() < deadline_s:
-            select.select([], [self._socket], [], _TELL_S)
+            select.select([], [self._socket], [], _PROGRESS_S)
             self._flush()
-            self._note_progress()
+            self._report_progress()
         self._socket.close()
 
     def wait(self, deadline_s: float) -> None:
-        """Until the process has ended."""
+        """Wait for the end of the process; kill it at the deadline."""
         while self._process.poll() is None:
             left_s = deadline_s - time.monotonic()
             if left_s <= 0.0:
-                self._process.kill()  # and not waited for: on a busy machine that takes time, too
+                self._process.kill()  # waiting for its end takes time, too, on a busy machine
                 print(
                     "a figure could not be drawn in time, and was not saved at the end",
                     file=sys.stderr,
                 )
                 break
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(min(left_s, _TELL_S))
-            self._note_progress()
+                self._process.wait(min(left_s, _PROGRESS_S))
+            self._report_progress()
         if self.dropped:
             count = self.dropped + self._sent
             print(f"{self.dropped} of {count} updates were not drawn", file=sys.stderr)
 
-    def _note_progress(self) -> None:
-        """The node may go on with its end, which waits for the drawing process."""
+    def _report_progress(self) -> None:
+        """Keep the supervisor from ending the node while it waits for the drawing process."""
         if self._node is not None:
             self._node.progress("")
 
@@ -188,7 +188,7 @@ class _Feed:
                 del self._unsent[:sent]
         except BlockingIOError:
             return
-        except OSError:  # it has ended, and has said why
+        except OSError:  # the process has ended, and has printed why
             self._is_gone = True
 
 
@@ -196,38 +196,27 @@ _OPEN: list[_Feed] = []
 
 
 def _close(feeds: Sequence[_Feed], patience_s: float) -> None:
-    """Let them end side by side."""
+    """Close figures in parallel."""
     deadline_s = time.monotonic() + patience_s
     closing = [feed for feed in feeds if feed in _OPEN]
     for feed in closing:
         _OPEN.remove(feed)
-        feed.hang_up(deadline_s)
+        feed.send_rest(deadline_s)
     for feed in closing:
         feed.wait(deadline_s)
 
 
 @atexit.register
 def _close_all() -> None:
-    """The process of the node ends; its figures are saved before."""
+    """Save the figures before the process ends."""
     _close(tuple(_OPEN), _PATIENCE_AT_END_S)
 
 
 class _Figure:
-    """Common part of all figures.
-
-    Args:
-        title: of the figure; its file is named after it, with a number where that is taken.
-        duration: how many seconds are shown, the latest ones; ``None``: all.
-        below: another figure, whose window and file this one shares, underneath.
-        save_every: seconds of wall time between two times that it is saved.
-        node: the ``node`` of the hook. When it ends it waits up to a minute until its figure is
-            saved; without it there are two seconds for that.
+    """Common part of all figures; :class:`VisualiseRotations` describes the arguments.
 
     Attributes:
-        file: where the figure is saved.
-
-    Raises:
-        EnvironmentFault: if Matplotlib is not installed.
+        file: the figure's file.
     """
 
     _KIND = ""
@@ -259,7 +248,7 @@ class _Figure:
 
     @property
     def dropped(self) -> int:
-        """Updates that were not drawn, since the drawing process had too many to draw."""
+        """Number of updates that were not drawn, since the drawing process was too slow."""
         return self._feed.dropped
 
     def caption(self, text: str) -> None:
@@ -267,7 +256,7 @@ class _Figure:
         self._feed.send(("caption", self._number, text))
 
     def close(self) -> None:
-        """Save the figure and close its window; happens by itself when the node ends."""
+        """Save the figure and close its window; the end of the node does so, too."""
         self._feed.close()
 
     def _add(self, name: str, colour: str | None, kind: str = "", **options: Any) -> None:
@@ -318,16 +307,15 @@ class VisualiseLines(_Figure):
 
 
 class VisualiseRotations(_Figure):
-    """Angles over time, in radians. Where one passes half a turn its line is broken, not drawn
-    across the figure.
+    """Angles over time, in radians. A line is broken where its angle passes half a turn.
 
     Args:
-        title: of the figure; its file is named after it.
-        duration: how many seconds are shown, the latest ones; ``None``: all.
+        title: of the figure; its file is named after it, with a number if that name is taken.
+        duration: seconds to show, the latest ones; ``None``: all.
         below: another figure, whose window and file this one shares, underneath.
-        save_every: seconds of wall time between two times that it is saved.
-        node: the ``node`` of the hook. When it ends it waits up to a minute until its figure is
-            saved; without it there are two seconds for that.
+        save_every: seconds of wall time between two saves.
+        node: the ``node`` of the hook. Its end waits up to a minute until the figure is saved, and
+            two seconds where it is not given.
 
     Raises:
         EnvironmentFault: if Matplotlib is not installed.
@@ -352,21 +340,24 @@ class VisualiseRotations(_Figure):
 
         Args:
             line_name: which line.
-            orientation: a quaternion with ``x``, ``y``, ``z``, ``w``, or an angle, as the line has
-                it.
+            orientation: a quaternion with ``x``, ``y``, ``z``, ``w``, or an angle, as the line
+                was added.
             timestamp: in seconds.
         """
         self._check(line_name)
         kind = self._kinds[line_name]
         if kind == "quaternion":
-            angle_rad = _yaw_of(orientation)
+            q = orientation
+            yaw = (2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+            angle_rad = math.atan2(*yaw)
         else:
             angle_rad = math.radians(orientation) if kind == "degrees" else float(orientation)
-        self._send(line_name, float(timestamp), _wrapped(angle_rad))
+        wrapped = math.remainder(angle_rad, math.tau)
+        self._send(line_name, float(timestamp), math.pi if wrapped == -math.pi else wrapped)
 
 
 class VisualiseImages(_Figure):
-    """Images side by side, each the latest one. Large ones are drawn with every n-th pixel."""
+    """The latest image of each name, side by side. Large ones are drawn with every n-th pixel."""
 
     _KIND = "images"
 
@@ -397,7 +388,10 @@ class VisualiseImages(_Figure):
             ValueError: for another encoding or shape.
         """
         self._check(name)
-        message = ("data", self._number, name, timestamp, _small_pixels(image))
+        pixels = _pixels(image)
+        step = max(1, math.ceil(max(pixels.shape[:2]) / _LARGEST_SIDE))
+        small = np.ascontiguousarray(pixels[::step, ::step])
+        message = ("data", self._number, name, timestamp, small)
         self._feed.send_latest(f"{self._number} {name}", message)
 
 
@@ -411,7 +405,7 @@ class VisualiseSpikes(_Figure):
     _KIND = "spikes"
 
     def add_population(self, name: str, size: int, colour: str | None = None) -> None:
-        """Add ``size`` neurons, above those that were added before."""
+        """Add ``size`` neurons above those of earlier populations."""
         self._add(name, colour, size=int(size))
 
     def plot(self, name: str, neurons: Any, timestamp: Any) -> None:
@@ -419,8 +413,8 @@ class VisualiseSpikes(_Figure):
 
         Args:
             name: of the population.
-            neurons: which, from 0, ``(n,)``.
-            timestamp: when, in seconds: one time for all, or ``(n,)``.
+            neurons: indices of the neurons that fired, from 0, ``(n,)``.
+            timestamp: in seconds: one time for all, or ``(n,)``.
         """
         which = np.atleast_1d(np.asarray(neurons, np.int64))
         times = np.broadcast_to(np.asarray(timestamp, np.float64), which.shape)
@@ -428,8 +422,8 @@ class VisualiseSpikes(_Figure):
 
 
 class VisualiseRing(_Figure):
-    """The activity of rings of neurons, such as a ring attractor: around the circle now, and over
-    time, with the direction that it stands for (population vector).
+    """Activity of rings of neurons, such as a ring attractor: around the circle now, and over time,
+    with the direction of the population vector.
 
     Args:
         title, duration, below, save_every, node: see :class:`VisualiseRotations`.
@@ -442,7 +436,7 @@ class VisualiseRing(_Figure):
         self._add(name, colour)
 
     def plot(self, name: str, activity: Sequence[float] | Any, timestamp: float) -> None:
-        """Add the activity of all its neurons, ``(n,)``, at a time in seconds."""
+        """Add the activity of all neurons, ``(n,)``, at a time in seconds."""
         self._send(name, float(timestamp), np.asarray(activity, np.float64).ravel())
 
 
@@ -455,18 +449,11 @@ def _file_for(title: str) -> Path:
     return next(file for name in names if (file := folder / f"{name}.png") not in taken)
 
 
-def _small_pixels(image: Any) -> Any:
-    """Every n-th pixel of a ``sensor_msgs/msg/Image`` or array; red comes first.
-
-    Raises:
-        ValueError: for an encoding or shape that cannot be drawn.
-    """
-    pixels = _pixels(image)
-    step = max(1, math.ceil(max(pixels.shape[:2]) / _LARGEST_SIDE))
-    return np.ascontiguousarray(pixels[::step, ::step])
-
-
 def _pixels(image: Any) -> Any:
+    """The pixels of a ``sensor_msgs/msg/Image`` or array, red first.
+
+    Raises ``ValueError`` for an encoding or shape that cannot be drawn.
+    """
     encoding = getattr(image, "encoding", None)
     if encoding is None:
         pixels = np.asarray(image)
@@ -489,19 +476,3 @@ def _pixels(image: Any) -> Any:
         return rows[:, :width]
     pixels = rows[:, : channels * width].reshape(height, width, channels)
     return pixels if encoding == "rgb8" else pixels[..., ::-1]
-
-
-def _yaw_of(orientation: Any) -> float:
-    """Rotation about the vertical in radians, (-pi, pi], of a unit quaternion.
-
-    ``orientation``: anything with ``x``, ``y``, ``z``, ``w``, such as
-    ``geometry_msgs/msg/Quaternion``.
-    """
-    q = orientation
-    return math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-
-
-def _wrapped(angle_rad: float) -> float:
-    """An angle in (-pi, pi]."""
-    remainder = math.remainder(angle_rad, math.tau)
-    return math.pi if remainder == -math.pi else remainder

@@ -1,4 +1,4 @@
-"""Drawing process of a figure: reads messages of hooks from its standard input, and draws."""
+"""The drawing process of a figure: receives messages of hooks on standard input, and draws."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ _GREY, _ALPHA = "0.6", 0.9
 
 
 class Series:
-    """Values over time: the last ``duration_s`` seconds, or all, and of very many every other.
+    """Values over time: the last ``duration_s`` seconds, or all.
 
-    Where time goes back, it drops what lies after.
+    Of very many values every other one is dropped; where time goes back, the values after it are.
     """
 
     def __init__(self, duration_s: float | None) -> None:
@@ -40,42 +40,33 @@ class Series:
 
     def add(self, time_s: float, value: Any) -> None:
         if not math.isfinite(time_s):
-            return  # there is no place for it
-        if self.times and time_s < self.times[-1]:  # a simulator was reset: what lay after is gone
+            return
+        if self.times and time_s < self.times[-1]:  # a simulator was reset
             kept = bisect_right(self.times, time_s)
             del self.times[kept:], self.values[kept:]
         self.times.append(time_s)
         self.values.append(value)
         if len(self.times) > _MOST_POINTS:
-            self._shorten()
+            if self._duration_s is not None:
+                start_s = max(self.times) - self._duration_s
+                pairs = zip(self.times, self.values, strict=True)
+                kept_pairs = [pair for pair in pairs if pair[0] >= start_s]
+                if len(kept_pairs) < _MOST_POINTS * 3 // 4:
+                    self.times, self.values = map(list, zip(*kept_pairs, strict=True))
+                    return
+            del self.times[1::2], self.values[1::2]
 
     def shown(self, end_s: float) -> tuple[Array, list[Any]]:
-        """Times and values of the shown time before ``end_s``."""
+        """Times and values of the shown seconds before ``end_s``."""
         times = np.array(self.times)
         if self._duration_s is None or not times.size:
             return times, self.values
         is_shown = times >= end_s - self._duration_s
         return times[is_shown], [v for v, shown in zip(self.values, is_shown, strict=True) if shown]
 
-    def _shorten(self) -> None:
-        if self._duration_s is not None:
-            start_s = max(self.times) - self._duration_s
-            kept = [
-                pair for pair in zip(self.times, self.values, strict=True) if pair[0] >= start_s
-            ]
-            if len(kept) < _MOST_POINTS * 3 // 4:
-                self.times, self.values = (list(each) for each in zip(*kept, strict=True))
-                return
-        del self.times[1::2], self.values[1::2]
-
 
 class Panel:
-    """One part of a figure.
-
-    Attributes:
-        columns: how many axes it needs, side by side.
-        caption: a line above it.
-    """
+    """One part of a figure; ``caption`` is a line above it."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
         self.caption = ""
@@ -96,7 +87,7 @@ class Panel:
 
     @property
     def end_s(self) -> float:
-        """The latest time that there is."""
+        """The latest time."""
         ends = [max(series.times) for series in self.series.values() if series.times]
         return max(ends, default=0.0)
 
@@ -108,7 +99,7 @@ class Panel:
         self.series[name].add(time_s, value)
 
     def draw(self, axes: Sequence[Any], end_s: float) -> None:
-        """Draw everything anew, up to a time that all parts of the figure share."""
+        """Draw everything anew, up to ``end_s``, the common end of all parts of the figure."""
         self._draw(axes, end_s)
         axes[0].set_title(self.caption, loc="left", fontsize="small")
 
@@ -185,7 +176,7 @@ class ImagesPanel(Panel):
             place.set_title(f"{name}{when}", fontsize="small")
 
     def draw(self, axes: Sequence[Any], end_s: float) -> None:
-        self._draw(axes, end_s)  # its titles are names
+        self._draw(axes, end_s)  # its titles are the names of images
 
 
 class SpikesPanel(Panel):
@@ -234,19 +225,17 @@ class RingPanel(Panel):
             times, values = self.series[name].shown(end_s)
             history.set_title(name, fontsize="small", color=self._colour(name))
             if len(values):
-                self._draw_now(circle, name, values[-1])
+                activity = values[-1]
+                phases = 2.0 * np.pi * (np.arange(activity.size + 1) + 0.5) / activity.size
+                circle.plot(phases, np.append(activity, activity[0]), color=self._colour(name))
+                direction = _population_vector(activity)
+                if direction is not None:
+                    circle.plot([direction, direction], [0.0, activity.max()], "--", color="0.2")
                 self._draw_history(history, times, np.array(values))
             self._time_axis(history, end_s)
 
-    def _draw_now(self, circle: Any, name: str, activity: Array) -> None:
-        phases = 2.0 * np.pi * (np.arange(activity.size + 1) + 0.5) / activity.size
-        circle.plot(phases, np.append(activity, activity[0]), color=self._colour(name))
-        direction = _population_vector(activity)
-        if direction is not None:
-            circle.plot([direction, direction], [0.0, activity.max()], "--", color="0.2")
-
     def _draw_history(self, history: Any, times: Array, values: Array) -> None:
-        """Activity by direction and time; columns are those nearest in time."""
+        """Draw activity by direction and time; each column is that of the nearest time."""
         grid = np.linspace(times[0], times[-1], min(_RING_COLUMNS, max(2, times.size)))
         nearest = np.clip(np.searchsorted(times, grid), 0, times.size - 1)
         half = values.shape[1] // 2
@@ -267,7 +256,7 @@ def _broken_at_wraps(time_s: Array, angle_rad: Array) -> tuple[Array, Array]:
 
 
 def _population_vector(activity: Array) -> float | None:
-    """The direction, in radians, that a ring of neurons stands for; ``None`` if it is silent.
+    """The direction of a ring of neurons, in radians; ``None`` if the ring is silent.
 
     Neuron ``i`` of ``n`` prefers ``2 pi (i + 1/2) / n``; the direction is that of the sum of these
     unit vectors, weighted by activity (Georgopoulos, Schwartz & Kettner, Science 233, 1416, 1986).
@@ -299,8 +288,8 @@ class Canvas:
     """Matplotlib figure with panels one below the other: in a window if possible, else in memory.
 
     Attributes:
-        is_window: whether there is one; its user may close it.
-        remark: why there is no window, empty if there is nothing to say.
+        is_window: whether there is a window; its user may close it.
+        remark: why there is no window; may be empty.
     """
 
     def __init__(self, title: str, environ: Mapping[str, str]) -> None:
@@ -318,7 +307,7 @@ class Canvas:
         self._figure.canvas.mpl_connect("close_event", self._on_closed)
 
     def draw(self, panels: Sequence[Panel]) -> list[str]:
-        """Draw all of them; returns a sentence for each that cannot be drawn."""
+        """Draw all panels; returns a sentence for each that cannot be drawn."""
         faults = []
         self._figure.clear()
         if not self.is_window:
@@ -334,7 +323,7 @@ class Canvas:
             ]
             try:
                 panel.draw(axes, end_s)
-            except Exception as error:  # of Matplotlib, about data that a plugin has given
+            except Exception as error:  # of Matplotlib, about a plugin's data
                 faults.append(f"'{panel.title}' cannot be drawn: {error}")
                 for each in axes:
                     each.clear()
@@ -343,25 +332,25 @@ class Canvas:
         return faults
 
     def save(self, path: Path) -> None:
-        """Replace the file by what was drawn last; it is never half written."""
+        """Replace the file by the last drawing, atomically."""
         new = path.with_suffix(".new.png")
         self._figure.savefig(new, dpi=100)
         os.replace(new, path)
 
-    def heed_user(self) -> None:
-        """Let the window react to clicks."""
+    def process_events(self) -> None:
+        """Let the window react to its user."""
         if self.is_window:
             self._figure.canvas.flush_events()
 
     def _on_closed(self, _: Any) -> None:
-        """The user has closed the window: go on without."""
+        """Go on without the window that the user has closed."""
         if self.is_window:
             self.is_window = False
             FigureCanvasAgg(self._figure)
 
 
 def _window(title: str) -> Any:
-    """A figure in a window; ``None`` where there is no toolkit for one."""
+    """A figure in a window; ``None`` without a toolkit."""
     from matplotlib import pyplot
 
     for toolkit in _TOOLKITS:
@@ -382,13 +371,13 @@ def _has_display(environ: Mapping[str, str]) -> bool:
 
 
 _REDRAW_S = 0.2
-_HEED_S = 0.05
+_EVENTS_S = 0.05
 _READ_BYTES = 1 << 20
 _LENGTH = struct.Struct("!I")
 
 
-class Messages:
-    """Messages from a file descriptor, in pieces of any size."""
+class MessageReader:
+    """Splits the data of a file descriptor into messages."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -396,11 +385,11 @@ class Messages:
         self.is_over = False
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether something can be read, now or before the time is over."""
+        """Whether data can be read, now or within the timeout."""
         return bool(select.select([self._descriptor], [], [], timeout_s)[0])
 
     def read(self) -> Iterator[tuple[Any, ...]]:
-        """All that is complete after one read; the other end is NeuROS in a node's process."""
+        """The messages that are complete after one read; only the node's process writes them."""
         data = os.read(self._descriptor, _READ_BYTES)
         self.is_over = not data
         self._data += data
@@ -413,11 +402,7 @@ class Messages:
 
 
 class Drawing:
-    """A figure, its panels, and when they are drawn.
-
-    Args:
-        title, file, save_every_s: of the first message.
-    """
+    """A figure, its panels, and the times of drawing and saving."""
 
     def __init__(self, title: str, file: str, save_every_s: float) -> None:
         self._canvas = Canvas(title, os.environ)
@@ -432,8 +417,8 @@ class Drawing:
         self._next_draw_s = time.monotonic()
         self._next_save_s = self._next_draw_s + save_every_s
 
-    def take(self, kind: str, number: int, *values: Any) -> None:
-        """Keep what a message says."""
+    def receive(self, kind: str, number: int, *values: Any) -> None:
+        """Apply a message to the panels."""
         self._is_new = True
         if kind == "panel":
             self._panels.append(PANELS[values[0]](values[1]))
@@ -444,8 +429,8 @@ class Drawing:
         else:
             self._panels[number].add_data(*values)
 
-    def look(self) -> float:
-        """Draw and save if it is time; returns for how many seconds there is nothing to do."""
+    def update(self) -> float:
+        """Draw and save if it is time; returns the seconds until the next call is due."""
         now_s = time.monotonic()
         is_saved_now = now_s >= self._next_save_s
         if self._is_new and (
@@ -453,35 +438,35 @@ class Drawing:
         ):
             self._draw()
             self._is_new = False
-            # What takes long is not done all the time.
+            # Drawing that takes long happens less often.
             took_s = time.monotonic() - now_s
             self._next_draw_s = time.monotonic() + max(_REDRAW_S, took_s)
             if is_saved_now:
                 self._save()
                 self._next_save_s = time.monotonic() + self._save_every_s
-        self._canvas.heed_user()
-        return _HEED_S if self._canvas.is_window else self._save_every_s
+        self._canvas.process_events()
+        return _EVENTS_S if self._canvas.is_window else self._save_every_s
 
-    def finish(self) -> None:
-        """Save what there is."""
+    def draw_and_save(self) -> None:
+        """Draw and save the final state."""
         self._draw()
         self._save()
 
     def _draw(self) -> None:
         try:
             for fault in self._canvas.draw(self._panels):
-                self._complain(fault)
-        except Exception as error:  # of Matplotlib, about a text that a plugin has given
-            self._complain(f"it cannot be drawn: {error}")
+                self._report(fault)
+        except Exception as error:  # of Matplotlib, about a plugin's text
+            self._report(f"it cannot be drawn: {error}")
 
     def _save(self) -> None:
         try:
             self._canvas.save(self._file)
-        except Exception as error:  # there may be room for it, or something else to draw, later
-            self._complain(f"{self._file} cannot be saved: {error}")
+        except Exception as error:  # the disk may have room later, or Matplotlib other data
+            self._report(f"{self._file} cannot be saved: {error}")
 
-    def _complain(self, text: str) -> None:
-        """Say it once: the figure is drawn again and again."""
+    def _report(self, text: str) -> None:
+        """Print a fault once, though the figure is drawn again and again."""
         if text not in self._faults:
             self._faults.add(text)
             print(f"{self._title}: {text}", file=sys.stderr, flush=True)
@@ -490,21 +475,21 @@ class Drawing:
 def main() -> None:
     """Draw until the node has gone, and save."""
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)  # it ends with its node, which is told
-    messages = Messages(0)
+        signal.signal(number, signal.SIG_IGN)  # the end of the node ends the stream of messages
+    messages = MessageReader(0)
     drawing: Drawing | None = None
-    pause_s = _HEED_S
+    pause_s = _EVENTS_S
     while not messages.is_over:
         if messages.wait(pause_s):
             for message in messages.read():
                 if message[0] == "figure":
                     drawing = Drawing(*message[1:])
                 elif drawing is not None:
-                    drawing.take(*message)
+                    drawing.receive(*message)
         if drawing is not None:
-            pause_s = drawing.look()
+            pause_s = drawing.update()
     if drawing is not None:
-        drawing.finish()
+        drawing.draw_and_save()
 
 
 if __name__ == "__main__":

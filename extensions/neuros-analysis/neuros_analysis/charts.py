@@ -45,7 +45,7 @@ def new_figure(height_in: float, width_in: float = _WIDTH_IN) -> Any:
 
 
 def plain(axes: Any) -> Any:
-    """Leave out the frame where nothing is read off; returns the axes."""
+    """Remove the frame's top and right edges and add a grid; returns the axes."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(visible=True, color="#E6E6E6", linewidth=0.7)
     axes.set_axisbelow(True)
@@ -58,7 +58,7 @@ def add_legend(figure: Any, columns: int, **options: Any) -> None:
 
 
 def _stacked_bars(names: Sequence[str], parts: Mapping[str, tuple[str, Any]]) -> tuple[Any, Any]:
-    """A bar per name, from the bottom up, of coloured parts; the figure and its axes."""
+    """A figure and its axes: a bar of coloured parts per name, from the bottom up."""
     figure = new_figure(0.42 * len(names) + 1.2)
     axes = plain(figure.add_subplot())
     lefts = np.zeros(len(names))
@@ -144,27 +144,22 @@ def ticks_figure(run: ReviewedRun) -> Any | None:
     figure = new_figure(2.6 * len(ticks))
     rows = figure.subplots(len(ticks), squeeze=False)[:, 0]
     for axes, (name, each) in zip(rows, ticks, strict=True):
-        _draw_ticks(plain(axes), name, each)
+        from_ms, counts = zip(*each["histogram"], strict=True)
+        low, high = min(from_ms), max(from_ms) + 0.1
+        bins = max(1, round((high - low) / 0.1))
+        width = 0.1 * max(1, -(-bins // 80))
+        edges = np.arange(low, high + width, width)
+        plain(axes).hist(np.array(from_ms) + 0.05, bins=edges, weights=counts, color=BLUE)
+        axes.axvline(each["period_ms"], color=GREY, linestyle="--", linewidth=1)
+        within = ", ".join(f"{share:.1%} within {ms}" for ms, share in each["within"].items())
+        axes.set_title(
+            f"{name}: period {each['period_ms']:g} ms (dashed), standard deviation"
+            f" {each['std_ms']:.2f} ms\n{within}",
+            fontsize=9, loc="left",
+        )  # fmt: skip
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set(xlabel="interval between starts / ms", ylabel="intervals")
     return figure
-
-
-def _draw_ticks(axes: Any, name: str, ticks: Mapping[str, Any]) -> None:
-
-    from_ms, counts = zip(*ticks["histogram"], strict=True)
-    low, high = min(from_ms), max(from_ms) + 0.1
-    bins = max(1, round((high - low) / 0.1))
-    width = 0.1 * max(1, -(-bins // 80))
-    edges = np.arange(low, high + width, width)
-    axes.hist(np.array(from_ms) + 0.05, bins=edges, weights=counts, color=BLUE)
-    axes.axvline(ticks["period_ms"], color=GREY, linestyle="--", linewidth=1)
-    within = ", ".join(f"{share:.1%} within {ms}" for ms, share in ticks["within"].items())
-    axes.set_title(
-        f"{name}: period {ticks['period_ms']:g} ms (dashed), standard deviation"
-        f" {ticks['std_ms']:.2f} ms\n{within}",
-        fontsize=9, loc="left",
-    )  # fmt: skip
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set(xlabel="interval between starts / ms", ylabel="intervals")
 
 
 def time_figure(run: ReviewedRun) -> Any | None:
@@ -222,7 +217,7 @@ _NODE, _BOX = (1.75, 0.8), (2.05, 0.8)
 
 
 def graph_figure(run: ReviewedRun) -> Any | None:
-    """Nodes with how they spent their time, connections with what they carried and how fast."""
+    """Nodes with their time budgets, connections with their traffic and latency."""
     if not run.nodes:
         return None
     budgets = run.time_budgets
@@ -246,10 +241,29 @@ def graph_figure(run: ReviewedRun) -> Any | None:
     for name, route in layout.routes.items():
         _draw_route(axes, route, widths, _shade(run, name), known[name].discard_limit is None)
     for name, place in layout.boxes.items():
-        _draw_box(axes, run, name, place)
+        connection, figures, (x, y) = run.ends[name], run.connections[name], _at(place)
+        losses = [f"{figures[key]:,} {key}" for key in ("discarded", "lost") if figures.get(key)]
+        counts = f"{_count(figures.get('sent'))} sent, {', '.join(losses) or 'none lost'}"
+        rate, latency = figures.get("rate_hz"), figures.get("latency_ms")
+        speed = [] if rate is None else [f"{rate:,.0f}/s" if rate >= 10 else f"{rate:.1f}/s"]
+        if latency:
+            speed.append(f"{_ms(latency['p50'])} (99 %: {_ms(latency['p99'])})")
+        lines = "\n".join([guarantee(connection), counts, ", ".join(speed)])
+        _rectangle(axes, x, y, _BOX, "white", _shade(run, name))
+        _write(axes, x, y + 0.25, _short(port_names(connection), 30), 8, weight="bold")
+        _write(axes, x, y - 0.11, lines, 6.8, linespacing=1.25)
     for name, place in layout.nodes.items():
         _draw_node(axes, name, place, budgets.get(name))
-    _draw_key(axes, rows)
+    handles = [
+        *(Patch(color=shade, label=state) for state, shade in _STATES.items()),
+        Line2D([], [], color=GREY, linestyle=_DOTTED, label="no discard limit"),
+        Line2D([], [], color=BLUE, label="discard limit"),
+        Line2D([], [], color=RED, label="blocked its sender over 10 % of the time"),
+    ]
+    axes.legend(
+        handles=handles, loc="lower center", ncols=4, frameon=False, fontsize=7.5,
+        bbox_to_anchor=(0.5, -0.02 - 0.06 / rows), handlelength=1.6,
+    )  # fmt: skip
     return figure
 
 
@@ -258,7 +272,7 @@ def _at(place: Place) -> tuple[float, float]:
 
 
 def _shade(run: ReviewedRun, name: str) -> str:
-    """Red where the sender was held up for long."""
+    """The colour of a connection: red if it blocked its sender over 10 % of the time."""
     spent = run.time_budgets.get(run.ends[name].source_node)
     if spent and run.running_s and spent.blocked.get(name, 0.0) > 0.1 * run.running_s:
         return RED
@@ -283,32 +297,8 @@ def _draw_route(
         axes.add_patch(line)
 
 
-def _draw_box(axes: Any, run: ReviewedRun, name: str, place: Place) -> None:
-    x, y = _at(place)
-    _rectangle(axes, x, y, _BOX, "white", _shade(run, name))
-    connection, figures = run.ends[name], run.connections[name]
-    lines = [guarantee(connection), _counts(figures), _speed(figures)]
-    _write(axes, x, y + 0.25, _short(port_names(connection), 30), 8, weight="bold")
-    _write(axes, x, y - 0.11, "\n".join(lines), 6.8, linespacing=1.25)
-
-
 def _write(axes: Any, x: float, y: float, text: str, size: float, **options: Any) -> None:
     axes.text(x, y, text, ha="center", va="center", fontsize=size, **options)
-
-
-def _counts(figures: Mapping[str, Any]) -> str:
-    lost = [
-        f"{figures[key]:,} {key}" for key in ("discarded", "lost") if (figures.get(key) or 0) > 0
-    ]
-    return f"{_count(figures.get('sent'))} sent, {', '.join(lost) or 'none lost'}"
-
-
-def _speed(figures: Mapping[str, Any]) -> str:
-    rate, latency = figures.get("rate_hz"), figures.get("latency_ms")
-    parts = [] if rate is None else [f"{rate:,.0f}/s" if rate >= 10 else f"{rate:.1f}/s"]
-    if latency:
-        parts.append(f"{_ms(latency['p50'])} (99 %: {_ms(latency['p99'])})")
-    return ", ".join(parts)
 
 
 def _ms(value: float) -> str:
@@ -332,20 +322,6 @@ def _draw_node(axes: Any, name: str, place: Place, spent: TimeBudget | None) -> 
         left += wide
 
 
-def _draw_key(axes: Any, rows: float) -> None:
-
-    handles = [
-        *(Patch(color=shade, label=state) for state, shade in _STATES.items()),
-        Line2D([], [], color=GREY, linestyle=_DOTTED, label="no discard limit"),
-        Line2D([], [], color=BLUE, label="discard limit"),
-        Line2D([], [], color=RED, label="blocked its sender over 10 % of the time"),
-    ]
-    axes.legend(
-        handles=handles, loc="lower center", ncols=4, frameon=False, fontsize=7.5,
-        bbox_to_anchor=(0.5, -0.02 - 0.06 / rows), handlelength=1.6,
-    )  # fmt: skip
-
-
 def _rectangle(
     axes: Any, x: float, y: float, size: tuple[float, float], face: str, edge: str
 ) -> None:
@@ -365,15 +341,15 @@ def _short(text: str, most: int) -> str:
 
 _SECOND_NS = 1_000_000_000
 _MOST_LINES = 4_000
-_CLOSE_LOOK = 12
-"""Packets on the busiest connection that the enlarged part shows."""
+_ENLARGED_PACKETS = 12
+"""The enlarged part shows so many packets of the busiest connection."""
 _HALF = 0.3
 _DASHES = (0, (2, 1.5))
 _Colours = dict[tuple[str, str], str]
 _HOOKS = (GREEN, SKY, PURPLE, RED, GREY, YELLOW)
-"""Colours of bars: those that lines do not have."""
+"""Colours of bars, which lines do not have."""
 _CROWD = 60
-"""Lines of a kind above which they are drawn finer."""
+"""From this number on lines of a kind are drawn thinner."""
 
 
 def timeline_figure(run: ReviewedRun) -> Any | None:
@@ -385,36 +361,35 @@ def timeline_figure(run: ReviewedRun) -> Any | None:
     start_ns = max((int(starts[0]) for starts in running.values() if len(starts)), default=None)
     if start_ns is None:
         return None
+    hooks = [(n, *each) for n in run.nodes if n in run.traces for each in run.traces[n].hooks]
+    # Initialise hooks, which are seldom visible, get the last colours.
+    hooks.sort(key=lambda each: each[2] == "initialise")
+    names = dict.fromkeys((node, hook) for node, hook, _ in hooks)
+    colours = {each: _HOOKS[place % len(_HOOKS)] for place, each in enumerate(names)}
     nodes = [name for name in run.nodes if name in run.traces]
-    colours = _hook_colours(run, nodes)
     figure = new_figure(2 * (0.62 * len(nodes) + 1.0) + 0.6)
     above, below = figure.subplots(2, 1)
-    close_ns = _close_look_ns(run, start_ns)
+    close_ns = _SECOND_NS
+    for packets in run.packets.values():
+        after = packets.sent_ns[packets.sent_ns >= start_ns][: _ENLARGED_PACKETS + 1]
+        if len(after) > _ENLARGED_PACKETS:
+            close_ns = min(close_ns, int(after[-1]) - start_ns)
+    close_ns = max(close_ns, 1_000)
     _draw(above, run, colours, start_ns, _SECOND_NS)
     above.set_title("the first second in which all nodes ran", fontsize=10, loc="left")
     _draw(below, run, colours, start_ns, close_ns)
     close_ms = float(f"{close_ns / 1e6:.3g}")
     below.set_title(f"the first {close_ms:g} ms of it", fontsize=10, loc="left")
-    _legend(figure, run, colours)
+    shown = {(node, hook) for node, hook, kind in hooks if kind != "initialise"}
+    handles: list[Any] = [
+        Patch(color=shade, label=".".join(each)) for each, shade in colours.items() if each in shown
+    ]
+    handles += [
+        Line2D([], [], color=BLUE, label="packet: sent, until a hook starts on it"),
+        Line2D([], [], color=ORANGE, linestyle=_DASHES, label="acknowledgement"),
+    ]
+    add_legend(figure, 3, handles=handles)
     return figure
-
-
-def _hook_colours(run: ReviewedRun, nodes: list[str]) -> _Colours:
-    """A colour for each hook; those of initialise hooks, which are seldom seen, come last."""
-    hooks = [(name, *each) for name in nodes for each in run.traces[name].hooks]
-    hooks.sort(key=lambda each: each[2] == "initialise")
-    names = dict.fromkeys((node, hook) for node, hook, _ in hooks)
-    return {each: _HOOKS[place % len(_HOOKS)] for place, each in enumerate(names)}
-
-
-def _close_look_ns(run: ReviewedRun, start_ns: int) -> int:
-    """A length that shows a dozen packets of the busiest connection."""
-    shortest = _SECOND_NS
-    for packets in run.packets.values():
-        after = packets.sent_ns[packets.sent_ns >= start_ns][: _CLOSE_LOOK + 1]
-        if len(after) > _CLOSE_LOOK:
-            shortest = min(shortest, int(after[-1]) - start_ns)
-    return max(shortest, 1_000)
 
 
 def _draw(axes: Any, run: ReviewedRun, colours: _Colours, start_ns: int, length_ns: int) -> None:
@@ -427,7 +402,7 @@ def _draw(axes: Any, run: ReviewedRun, colours: _Colours, start_ns: int, length_
             chosen = is_here & (trace.which == place)
             starts_ns = trace.starts_ns[chosen]
             spans = np.column_stack([starts_ns - start_ns, trace.ends_ns[chosen] - starts_ns]) / 1e6
-            # A line around each keeps visible what is shorter than a dot.
+            # The edge keeps executions visible that are shorter than a dot.
             shade = colours[name, hook]
             axes.broken_barh(
                 spans, (row[name] - _HALF, 2 * _HALF), facecolor=shade, edgecolor=shade,
@@ -454,11 +429,13 @@ def _draw_packets(
         return
     side = 1 if receiver > sender else -1
     away, towards = sender + side * _HALF, receiver - side * _HALF
+    flights_ns = run.flights_ns(name)
+    flights = _within(flights_ns, window) if flights_ns is not None else None
     for times, ends, shade, dashes in (
-        (_flights(run, name, window), (away, towards), BLUE, "solid"),
+        (flights, (away, towards), BLUE, "solid"),
         (_answers(run, name, window), (towards, away), ORANGE, _DASHES),
     ):
-        if times is not None:
+        if times is not None and len(times):
             is_crowd = len(times) > _CROWD
             segments: Any = np.stack([times, np.broadcast_to(ends, times.shape)], axis=2)
             lines = LineCollection(
@@ -468,16 +445,10 @@ def _draw_packets(
             axes.add_collection(lines)
 
 
-def _flights(run: ReviewedRun, name: str, window: tuple[int, int]) -> Numbers | None:
-    """Milliseconds of sending and of the start on it, for packets of the window, (n, 2)."""
-    flights_ns = run.flights_ns(name)
-    return None if flights_ns is None or not len(flights_ns) else _within(flights_ns, window)
-
-
 def _answers(run: ReviewedRun, name: str, window: tuple[int, int]) -> Numbers | None:
-    """Milliseconds of acknowledgements: from the start on a packet to when its sender knew.
+    """Start on a packet and arrival of its acknowledgement, in milliseconds, (n, 2).
 
-    They are cumulative: one is drawn from the last packet that it counts.
+    Acknowledgements are cumulative: each belongs to the last packet that it counts.
     """
     end = run.ends[name]
     trace = run.traces.get(end.source_node)
@@ -498,21 +469,6 @@ def _within(times_ns: Numbers, window: tuple[int, int]) -> Numbers:
     is_here = (times_ns[:, 1] >= start_ns) & (times_ns[:, 0] < start_ns + length_ns)
     found: Numbers = (times_ns[is_here][:_MOST_LINES] - start_ns) / 1e6
     return found
-
-
-def _legend(figure: Any, run: ReviewedRun, colours: _Colours) -> None:
-
-    kinds = {(n, hook): kind for n, trace in run.traces.items() for hook, kind in trace.hooks}
-    handles: list[Any] = [
-        Patch(color=shade, label=".".join(each))
-        for each, shade in colours.items()
-        if kinds[each] != "initialise"
-    ]
-    handles += [
-        Line2D([], [], color=BLUE, label="packet: sent, until a hook starts on it"),
-        Line2D([], [], color=ORANGE, linestyle=_DASHES, label="acknowledgement"),
-    ]
-    add_legend(figure, 3, handles=handles)
 
 
 def comparison_figure(runs: Sequence[ReviewedRun]) -> Any | None:

@@ -6,10 +6,9 @@ import argparse
 import contextlib
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import TYPE_CHECKING, Any
 
 from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
@@ -102,8 +101,17 @@ def _report(options: argparse.Namespace) -> int:
 
 def _compare(options: argparse.Namespace) -> int:
     from neuros_analysis.comparison import comparison_rows, comparison_table, figures_of, labels_of
+    from neuros_analysis.review import open_for_review
 
-    runs, refused = _readable(options.runs)
+    runs: list[ReviewedRun] = []
+    refused: list[NeurosError] = []
+    for folder in options.runs:
+        try:
+            runs.append(open_for_review(folder))
+        except (UsageError, EnvironmentFault) as error:
+            refused.append(error)
+    if not runs:
+        raise UsageError("\n".join(map(str, refused)))
     header, rows = comparison_rows(runs)
     is_json = options.format == JSON
     if is_json:
@@ -115,34 +123,18 @@ def _compare(options: argparse.Namespace) -> int:
             for line in run.missing:
                 print(f"missing in {label}: {line}")
     if options.output is not None:
-        page = _comparison(runs, header, rows)
+        page = _comparison_page(runs, header, rows)
         with _writing(options.output.parent):
             options.output.parent.mkdir(parents=True, exist_ok=True)
             options.output.write_bytes(page)
         if not is_json:
             print(options.output)
-    for error in refused:
-        print(f"neuros: left out: {error}", file=sys.stderr)
+    for reason in refused:
+        print(f"neuros: left out: {reason}", file=sys.stderr)
     return EXIT_LEFT_OUT if refused else 0
 
 
-def _readable(folders: Sequence[Path]) -> tuple[list[ReviewedRun], list[NeurosError]]:
-    """The runs that can be shown, and why the others cannot. Raises ``UsageError`` if none can."""
-    from neuros_analysis.review import open_for_review
-
-    runs: list[ReviewedRun] = []
-    refused: list[NeurosError] = []
-    for folder in folders:
-        try:
-            runs.append(open_for_review(folder))
-        except (UsageError, EnvironmentFault) as error:
-            refused.append(error)
-    if not runs:
-        raise UsageError("\n".join(map(str, refused)))
-    return runs, refused
-
-
-def _comparison(runs: list[ReviewedRun], header: list[str], rows: list[list[str]]) -> bytes:
+def _comparison_page(runs: list[ReviewedRun], header: list[str], rows: list[list[str]]) -> bytes:
     from neuros_analysis.charts import comparison_figure
     from neuros_analysis.comparison import labels_of
     from neuros_analysis.findings import findings_of
@@ -187,27 +179,23 @@ def add_sweep(command: argparse.ArgumentParser) -> None:
 def _sweep(parsed: argparse.Namespace) -> int:
     from neuros_analysis.sweep import CSV_NAME, sweep
 
+    def warn(message: Warning | str, *_: Any, **__: Any) -> None:
+        print(f"warning: {message}", file=sys.stderr)  # without the line of Python
+
+    def print_row(number: int, count: int, row: Mapping[str, Any]) -> None:
+        values = list(row)[: list(row).index("exit_code")]
+        what = ", ".join(f"{name}={row[name]}" for name in values) or "run"
+        stream = sys.stderr if is_json else sys.stdout
+        print(f"[{number}/{count}] {what}: {row['reason']}", file=stream, flush=True)
+
+    is_json = parsed.format == JSON
     with warnings.catch_warnings():
         warnings.simplefilter("default", UserWarning)
-        warnings.showwarning = _warn
+        warnings.showwarning = warn
         options = values_of(options_of(SweepOptions), parsed)
-        is_json = parsed.format == JSON
-        say = partial(_say_row, sys.stderr if is_json else sys.stdout)
-        made = sweep(parsed.project, **options, on_row=say)
+        made = sweep(parsed.project, **options, on_row=print_row)
     if is_json:
         print_json({"folder": made.folder, "rows": made.rows})
     else:
         print(f"\n{made}\n\n{made.folder / CSV_NAME}")
     return 0 if all(row["exit_code"] == 0 for row in made.rows) else EXIT_FAILED
-
-
-def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
-    """What may be a mistake in the project, without the line of Python that found it."""
-    print(f"warning: {message}", file=sys.stderr)
-
-
-def _say_row(stream: TextIO, number: int, count: int, row: Mapping[str, Any]) -> None:
-    """One line when a run has ended."""
-    values = list(row)[: list(row).index("exit_code")]
-    what = ", ".join(f"{name}={row[name]}" for name in values) or "run"
-    print(f"[{number}/{count}] {what}: {row['reason']}", file=stream, flush=True)

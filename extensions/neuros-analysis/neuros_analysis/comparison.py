@@ -10,7 +10,7 @@ from neuros.api.run_record import consumed_percent
 from neuros_analysis.review import ReviewedRun
 
 _Figures = dict[tuple[str, int], float | None]
-"""Values by their name and the digits after the point."""
+"""Values by name and number of decimals."""
 
 
 def labels_of(runs: Sequence[ReviewedRun]) -> list[str]:
@@ -24,7 +24,7 @@ def labels_of(runs: Sequence[ReviewedRun]) -> list[str]:
 
 
 def comparison_rows(runs: Sequence[ReviewedRun]) -> tuple[list[str], list[list[str]]]:
-    """A header, and rows: what, its value in each run, and of two runs the ratio B / A."""
+    """A header, and rows: a name, its value in each run, and of two runs the ratio B / A."""
     rows = []
     for (name, digits), values in _side_by_side(runs).items():
         cells = ["-" if value is None else f"{value:,.{digits}f}" for value in values]
@@ -47,10 +47,10 @@ def comparison_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> st
 
 
 def _side_by_side(runs: Sequence[ReviewedRun]) -> dict[tuple[str, int], list[float | None]]:
-    """By name and digits after the point, the value in each run; what no run has is left out."""
+    """The value in each run by name and number of decimals; rows without any value are left out."""
     parts = [_figures(run) for run in runs]
     found = {}
-    for part in zip(*parts, strict=True):  # of all runs, before the next part of any
+    for part in zip(*parts, strict=True):  # the same part of all runs
         for key in dict.fromkeys(key for figures in part for key in figures):
             values = [figures.get(key) for figures in part]
             if any(value is not None for value in values):

@@ -1,17 +1,16 @@
 """Findings on a run: the bottleneck, the gain of each discard limit, and both in sentences.
 
-The search begins at the node that sets the pace and asks what holds it up. Blocked on a connection:
-the receiver does, which is asked next. Waiting for an input: its sender does. A node that nothing
-holds up for long is the bottleneck, and so is one that mostly waits for its own clock. Where the
-search comes back to a node that it has seen, the nodes wait for each other in a loop, and the
-bottleneck is the one that executes most, if it does so more than half of the time.
+The search begins at the node that sets the pace, and follows the causes of its delays: blocked on a
+connection, to the receiver; waiting for an input, to the sender. A node without long delays is the
+bottleneck, and so is one that mostly waits for its own clock. Nodes that wait for each other form a
+loop; its bottleneck is the node that executes most, if it does so over half of the time.
 
-The prediction is a bound for a run whose hooks cost what they cost in this one. Without the discard
-limit of a connection its sender loses no time any more in which that connection blocked it, and
-whatever happens later in the run happens earlier by no more than the sum of that; nor is the pacing
-node faster than any node that remains coupled to it by lossless connections needs for its own
-hooks. Where processors are short, hooks cost more when others run more often, and less when packets
-are lost that need not be worked on: then it may be off either way.
+The prediction is a bound for a run whose hooks cost as much as in this one. Without the discard
+limit of a connection its sender spares the time in which that connection blocked it, and no later
+event comes earlier by more than the sum of those times; nor can the pacing node be faster than the
+own hooks of the nodes that lossless connections still couple to it. With too few processors the
+prediction may be off either way: hooks cost more when others run more often, and less when packets
+are lost.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ WORTH_NAMING = 0.02
 """Share of the time below which a cause is noise."""
 
 HELD_UP = 0.1
-"""Share of the time from which on a node counts as held up by others."""
+"""Share of the time above which a node counts as held up by others."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the search: a node, what took most of its time, and which share that was.
+    """One step of the search: a node, the state it spent most of its time in, and that share.
 
     Attributes:
         state: ``"executing"``, ``"waiting"``, ``"blocked"`` or ``"idle"``.
@@ -52,8 +51,8 @@ class Gain:
     """Gain of a run without some discard limits.
 
     Attributes:
-        connections: those that would have none.
-        up_to: how many times as fast the run would be if hooks cost what they cost; 1 is nothing.
+        connections: the connections without a discard limit.
+        up_to: the largest factor by which the run would be faster; 1 is no gain.
     """
 
     connections: tuple[str, ...]
@@ -65,7 +64,7 @@ class Bottleneck:
     """Node or loop that limits the speed of a run.
 
     Attributes:
-        pacing: the node whose speed counts: it owns time, or else it was held up most.
+        pacing: the node that owns time, or else the one that was held up most.
         steps: from the pacing node to the root.
         root: the node that limits the speed; ``None`` for a loop of nodes, or if not known.
         loop: the nodes that wait for each other, if the search ended in a loop.
@@ -85,12 +84,12 @@ def find_bottleneck(
     running_s: float,
     time_owner: str | None = None,
 ) -> Bottleneck | None:
-    """Search for what limits a run whose nodes overlap.
+    """Find the bottleneck of a run whose nodes run in parallel.
 
     Args:
         budgets: by node.
         connections: by name.
-        running_s: how long the run was under way.
+        running_s: wall time in which all nodes ran.
         time_owner: the node that owns simulated time.
 
     Returns:
@@ -108,8 +107,12 @@ class _Search:
     running_s: float
 
     def bottleneck(self, time_owner: str | None) -> Bottleneck:
-        pacing = time_owner if time_owner in self.budgets else self._most_held_up()
-        assert pacing is not None
+        pacing = time_owner
+        if pacing is None or pacing not in self.budgets:
+            blocked = {node: sum(spent.blocked.values()) for node, spent in self.budgets.items()}
+            pacing = max(blocked, key=lambda node: blocked[node])
+            if blocked[pacing] <= WORTH_NAMING * self.budgets[pacing].total_s:
+                pacing = max(self.budgets, key=self._own_s)
         steps, loop = self._follow(pacing)
         root: str | None = steps[-1].node
         if steps[-1].state not in ("executing", "idle"):
@@ -120,13 +123,6 @@ class _Search:
 
     def _own_s(self, node: str) -> float:
         return self.budgets[node].own_s
-
-    def _most_held_up(self) -> str:
-        blocked = {node: sum(spent.blocked.values()) for node, spent in self.budgets.items()}
-        most = max(blocked, key=lambda node: blocked[node])
-        if blocked[most] > WORTH_NAMING * self.budgets[most].total_s:
-            return most
-        return max(self.budgets, key=self._own_s)
 
     def _follow(self, node: str) -> tuple[list[Step], tuple[str, ...]]:
         """The steps, and the loop in which they end."""
@@ -158,7 +154,7 @@ class _Search:
         return Step(node, state, cause, spent.share(share_s))
 
     def _held_up_by(self, step: Step) -> str | None:
-        """The node to ask next, ``None`` where the search ends."""
+        """The next node of the search, ``None`` at its end."""
         if step.state == "blocked" and step.cause in self.connections:
             receiver = self.connections[step.cause].destination_node
             return receiver if receiver in self.budgets else None
@@ -169,7 +165,7 @@ class _Search:
                 if (c.destination_node, c.destination_input) == (step.node, step.cause)
                 and c.source_node in self.budgets
             ]
-            # Of several senders of one input, the one with most to do is taken for the late one.
+            # Of several senders of an input, the busiest one is likely to be late.
             return max(senders, key=self._own_s, default=None)
         return None
 
@@ -192,21 +188,20 @@ class _Search:
             together = tuple(n for n, c in limited.items() if c.destination_node == receiver)
             if len(together) > 1:
                 cuts.append(together)
-        gains = [Gain(cut, self.running_s / self._least_s(pacing, cut)) for cut in cuts]
+        gains = []
+        for cut in cuts:
+            spared_s = sum(map(self._blocked_s, cut))
+            slowest_s = max(map(self._own_s, self._coupled(pacing, cut)))
+            least_s = min(self.running_s, max(self.running_s - spared_s, slowest_s, 1e-9))
+            gains.append(Gain(cut, self.running_s / least_s))
         return tuple(sorted(gains, key=lambda gain: (-round(gain.up_to, 2), len(gain.connections))))
 
     def _blocked_s(self, connection: str) -> float:
         sender = self.connections[connection].source_node
         return self.budgets[sender].blocked.get(connection, 0.0)
 
-    def _least_s(self, pacing: str, cut: Sequence[str]) -> float:
-        """The least time that the same run could take with ``cut`` free of discard limits."""
-        spared_s = sum(map(self._blocked_s, cut))
-        slowest_s = max(map(self._own_s, self._coupled(pacing, cut)))
-        return min(self.running_s, max(self.running_s - spared_s, slowest_s, 1e-9))
-
     def _coupled(self, node: str, cut: Sequence[str]) -> set[str]:
-        """The nodes that must keep up with ``node``: behind it, by lossless connections."""
+        """``node`` and all nodes behind it along lossless connections without those of ``cut``."""
         found, new = {node}, [node]
         while new:
             at = new.pop()
@@ -229,9 +224,9 @@ class Findings:
 
     Attributes:
         headline: the bottleneck, in a sentence.
-        reasons: how that is known, and how far it can be trusted.
-        gains: what would be gained without discard limits, a sentence each.
-        trial: a command that tests the best of them, ``None`` if there is nothing to gain.
+        reasons: the evidence, and how far it can be trusted.
+        gains: the gain without discard limits, a sentence each.
+        trial: a command that tests the best gain, ``None`` without one.
     """
 
     headline: str
@@ -241,7 +236,7 @@ class Findings:
 
 
 def findings_of(run: ReviewedRun) -> Findings:
-    """Say what limits a run."""
+    """The findings on a run, in sentences."""
     budgets = run.time_budgets
     if not budgets or not run.running_s:
         return Findings("The bottleneck is not known: no node has reported how it spent its time.")
@@ -255,11 +250,22 @@ def findings_of(run: ReviewedRun) -> Findings:
     if not gains:
         gains = ["Discard limits do not slow this run down."]
     best = next((gain for gain in found.gains if gain.up_to >= _WORTH_A_TRY), None)
+    trial = None
+    if best is not None:
+        ends = [run.ends[name] for name in best.connections]
+        settings = (
+            f"connections.{c.source_node}.{c.source_output}.{c.destination_node}"
+            f".{c.destination_input}.discard_limit="
+            for c in ends
+        )
+        options = [part for setting in settings for part in ("--set", setting)]
+        file = str(run.record.get("file", "PROJECT"))
+        trial = shlex.join(["neuros", "launch", file, *options])
     return Findings(
         _headline(found, budgets),
         tuple(reasons),
         tuple(gains),
-        None if best is None else _trial(best, run),
+        trial,
     )
 
 
@@ -344,17 +350,8 @@ def _gain(gain: Gain, record: Mapping[str, Any]) -> str:
     return f"{text}. Packets may then be lost there."
 
 
-def _trial(gain: Gain, run: ReviewedRun) -> str:
-    settings = []
-    for name in gain.connections:
-        c = run.ends[name]
-        ends = f"{c.source_node}.{c.source_output}.{c.destination_node}.{c.destination_input}"
-        settings += ["--set", f"connections.{ends}.discard_limit="]
-    return shlex.join(["neuros", "launch", str(run.record.get("file", "PROJECT")), *settings])
-
-
 def _one_process(run: ReviewedRun, budgets: Mapping[str, TimeBudget], running_s: float) -> Findings:
-    """One thread runs all hooks: none overlap, so that no node holds up another."""
+    """Findings on a run in one thread, in which no node holds up another."""
     node, (hook, busy_s) = max(
         ((name, spent.busiest_hook) for name, spent in budgets.items()), key=lambda x: x[1][1]
     )

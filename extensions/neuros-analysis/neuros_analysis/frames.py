@@ -1,7 +1,7 @@
 """Recorded packets and figures of runs as frames of pandas and datasets of xarray.
 
-Units are those that the definitions of ROS messages state (REP 103); a field whose unit depends on
-something else, as the position of a joint, has none.
+Units are those of the definitions of ROS messages (REP 103); a field whose unit depends on other
+data, as the position of a joint, has none.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ _UNITS = {
 
 
 def table(rows: Iterable[Mapping[str, Any]], index: str | None = None) -> Any:
-    """A ``pandas.DataFrame``, one row each; ``index``: the column that names them."""
+    """A ``pandas.DataFrame`` of rows; ``index``: the column that names them."""
     made = pd.DataFrame(list(rows))
     return made if index is None or made.empty else made.set_index(index)
 
 
 def frame(topic: RecordedTopic, clock: Literal["wall", "sim"]) -> Any:
-    """What :meth:`RecordedTopic.frame` returns."""
+    """The result of :meth:`RecordedTopic.frame`."""
     spread: dict[str, Any] = {}
     columns = topic.columns()
     for name, column in columns.items():
@@ -82,7 +82,7 @@ def frame(topic: RecordedTopic, clock: Literal["wall", "sim"]) -> Any:
 
 
 def dataset(topic: RecordedTopic, types: Mapping[str, Any], start_ns: int) -> Any:
-    """What :meth:`RecordedTopic.xarray` returns.
+    """The result of :meth:`RecordedTopic.xarray`.
 
     Args:
         types: the field definitions of the bag's types.

@@ -1,7 +1,7 @@
-"""A run as it is reviewed: what there is of it, and what is missing.
+"""Reading of runs for reports: all that a run folder holds, and what is missing.
 
-Of a run that goes on, was cut off, or is of an earlier version, :func:`open_for_review` reads what
-there is; :func:`neuros.api.run_record.open_run` refuses these.
+:func:`open_for_review` also reads a run that goes on, was cut off, or is of an earlier version,
+which :func:`neuros.api.run_record.open_run` refuses.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from neuros.recording.run_file import RUN_FILE, check_record, read_object, read_
 from neuros.recording.system_load import FILE_NAME
 from neuros.registry import ran_in_one_process
 
-_MOST = 2.0**63  # of what is measured; a figure cannot have axes of any length
+_MOST = 2.0**63  # of a measured value; the axes of a figure cannot be longer
 _MOST_HOOKS = 10_000
 
 
@@ -45,10 +45,10 @@ class Trace:
 
     Attributes:
         hooks: name and kind of each hook that ran.
-        which: of each execution, its hook's place in ``hooks``, (executions,).
-        starts_ns, ends_ns: from when to when, (executions,).
+        which: the place in ``hooks`` of each execution's hook, (executions,).
+        starts_ns, ends_ns: of each execution, (executions,).
         credits: index of the connection, position and arrival of each acknowledgement, (n, 3).
-        damaged: files of which the rest is left out, from an entry that no node has written.
+        damaged: files that are read only up to an entry that no node writes.
     """
 
     hooks: tuple[tuple[str, str], ...]
@@ -60,7 +60,7 @@ class Trace:
 
     @property
     def is_running(self) -> Numbers:
-        """Which executions were not of initialise hooks, (executions,)."""
+        """Whether each execution is of another hook than an initialise hook, (executions,)."""
         initialisers = [i for i, (_, kind) in enumerate(self.hooks) if kind == "initialise"]
         found: Numbers = ~np.isin(self.which, initialisers)
         return found
@@ -80,7 +80,7 @@ def read_trace(folder: Path) -> Trace:
         names = [(str(hook["name"]), str(hook["kind"])) for hook in hooks]
     except (OSError, ValueError, TypeError, KeyError, RecursionError):
         names = []
-    # A node that was killed may have listed a hook's execution, and not its name.
+    # A node that was killed may have recorded an execution, but not the hook's name.
     count = int(executions[:, 0].max()) + 1 if len(executions) else 0
     names += [(f"hook {place + 1}", "function") for place in range(len(names), count)]
     which, starts_ns, ends_ns = executions.T
@@ -90,10 +90,10 @@ def read_trace(folder: Path) -> Trace:
 
 @dataclass(frozen=True)
 class ReviewedRun(PastRun):
-    """A run, with what pages and figures show of it.
+    """A run, with the data for pages and figures.
 
     Attributes:
-        missing: a sentence for each thing that could not be told.
+        missing: a sentence for each missing part.
     """
 
     missing: tuple[str, ...] = ()
@@ -131,7 +131,7 @@ class ReviewedRun(PastRun):
         return {name: read_packets(self.folder, end) for name, end in self.ends.items()}
 
     def flights_ns(self, connection: str) -> Numbers | None:
-        """When a packet was sent, and when a hook started on it, for each start, if known."""
+        """Sending of a packet and start of a hook on it, for each start, (n, 2), if known."""
         may_lose = may_have_lost(self.connections[connection])
         return self.packets[connection].flights_ns(may_lose=may_lose)
 
@@ -147,16 +147,16 @@ class ReviewedRun(PastRun):
         return {name: trace for name, trace in found.items() if len(trace.starts_ns)}
 
     def trace(self, node: str) -> Trace:
-        """The first executions of a node, as far as it has listed them."""
+        """The recorded first executions of a node."""
         return read_trace(self.folder / node / FOLDER)
 
 
 def open_for_review(folder: Path) -> ReviewedRun:
-    """Read what there is in a run folder.
+    """Read a run folder, also an incomplete one.
 
     Raises:
-        UsageError: if no run has left it behind, the run goes on, or another version wrote it.
-        EnvironmentFault: if it is damaged.
+        UsageError: the folder is of no run, the run goes on, or another version wrote it.
+        EnvironmentFault: a file is damaged.
     """
     if (folder / RUN_FILE).exists():
         record, missing = read_run_file(folder), list[str]()
@@ -167,7 +167,7 @@ def open_for_review(folder: Path) -> ReviewedRun:
 
 
 def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
-    """A record from files that were written before and during the run."""
+    """A record from the files that exist before the end of a run, and what it lacks."""
     if not (folder / "project.json").is_file():
         raise UsageError(f"{folder} has no run.json: it is not the folder of a run")
     project = read_object(folder / "project.json")
@@ -201,7 +201,7 @@ def _from_project(folder: Path) -> tuple[dict[str, Any], list[str]]:
         packets = read_packets(folder, connection_of(figures))
         figures["sent"] = packets.sent_before + len(packets.sent_ns)
         figures["received"] = packets.received_before + len(packets.received)
-        if not packets.taken_before:  # several hooks may have started on one that is not listed
+        if not packets.taken_before:  # else several hooks may share an unlisted packet
             figures["consumed"] = len({*packets.taken.tolist()})
         figures |= packet_figures(packets, may_lose=may_have_lost(figures))
     return record, [
@@ -242,10 +242,10 @@ def read_load(
 ) -> dict[str, list[float]]:
     """The columns of ``system_load.csv``, NaN where a cell is empty; none if there is no file.
 
-    Rows with what is no number are left out, as the last one of a run that was cut off.
+    Rows with a cell that is not a number are left out, as the last row of a run that was cut off.
 
     Args:
-        complain: told if it is damaged; what comes before the damage is returned.
+        complain: called with a sentence about damage; the columns end there.
     """
     rows: list[list[str]] = []
     try:

@@ -36,12 +36,12 @@ from neuros_analysis.findings import Findings
 from neuros_analysis.review import ReviewedRun
 
 MOST_SPIKES = 2_000_000
-"""Of one output; later ones are left out."""
+"""Of one output; further ones are left out."""
 MOST_ARRAYS = 3000
-"""Packets of one output; of more, every k-th is shown."""
+"""Packets of one output; of more, every k-th is drawn."""
 LONGEST_ARRAY = 4096
 MOST_FRAMES = 6000
-"""Of the page of a world; of a longer recording, every k-th frame is shown."""
+"""Frames of a world; of more, every k-th is drawn."""
 
 _SCRIPTS = files("neuros") / "javascript"
 _WORLD_SCRIPTS = {"library": "vendor/three.iife.min.js", "scene": "scene.js"}
@@ -62,9 +62,18 @@ def report_page(
     """The page of a run.
 
     Args:
-        figures: by title, what is seen on each in a sentence, and its PNG.
+        figures: by title, a sentence about the figure, and its PNG.
     """
-    parts = [_facts(run), bottleneck_part(findings)]
+    record = run.record
+    facts = [str(record.get("reason") or "ended normally")]
+    if record.get("sim_s") is not None:
+        facts.append(f"{record['sim_s']:.2f} s of simulated time")
+    if record.get("wall_s") is not None:
+        facts.append(f"{record['wall_s']:.2f} s of wall time")
+    if record.get("real_time_factor"):
+        facts.append(f"real-time factor {record['real_time_factor']:.2f}")
+    facts += [f"broken budget: {each}" for each in record.get("broken_budgets", ())]
+    parts = [f"<p>{escape('; '.join(facts))}.</p>", bottleneck_part(findings)]
     if run.missing:
         items = "".join(f"<li>{escape(each)}</li>" for each in run.missing)
         text = f"<p>What this page lacks:</p><ul>{items}</ul>"
@@ -119,19 +128,6 @@ def figure_part(title: str, text: str, data: bytes) -> str:
     )
 
 
-def _facts(run: ReviewedRun) -> str:
-    record = run.record
-    parts = [str(record.get("reason") or "ended normally")]
-    if record.get("sim_s") is not None:
-        parts.append(f"{record['sim_s']:.2f} s of simulated time")
-    if record.get("wall_s") is not None:
-        parts.append(f"{record['wall_s']:.2f} s of wall time")
-    if record.get("real_time_factor"):
-        parts.append(f"real-time factor {record['real_time_factor']:.2f}")
-    parts += [f"broken budget: {each}" for each in record.get("broken_budgets", ())]
-    return f"<p>{escape('; '.join(parts))}.</p>"
-
-
 def _connections(run: ReviewedRun) -> str:
     header = ["connection", "sent", "received", "consumed", "discarded", "lost",
               "longest discard", "rate / Hz", "median / ms", "99 % / ms", "max / ms"]  # fmt: skip
@@ -159,6 +155,9 @@ def _provenance(run: ReviewedRun) -> str:
     machine, versions = record.get("machine") or {}, record.get("versions") or {}
     git = record.get("git") or {}
     back_end = back_end_of(record)
+    memory = f"{machine['memory_bytes'] / 1e9:.1f} GB" if "memory_bytes" in machine else None
+    cores = f"{machine['cores']} cores" if "cores" in machine else None
+    hardware = [machine.get("processor"), cores, memory, machine.get("system")]
     started = record.get("started")
     when = datetime.fromtimestamp(started, timezone.utc) if started else None
     cells = {
@@ -166,7 +165,7 @@ def _provenance(run: ReviewedRun) -> str:
         "project": record.get("file"),
         "started": when and when.strftime("%Y-%m-%d %H:%M:%S UTC"),
         "back end": record.get("backend"),
-        "machine": machine and _machine(machine),
+        "machine": ", ".join(str(part) for part in hardware if part),
         "NeuROS, Python": versions and f"{versions.get('neuros')}, {versions.get('python')}",
         "git": git and f"{git.get('commit')}{' (changed)' if git.get('is_dirty') else ''}",
         **(back_end.provenance(record) if back_end else {}),
@@ -179,13 +178,6 @@ def _provenance(run: ReviewedRun) -> str:
     }
     rows = [[key, str(value)] for key, value in cells.items() if value]
     return table_part("Where it comes from", ["", ""], rows, "text")
-
-
-def _machine(machine: Mapping[str, Any]) -> str:
-    memory = f"{machine['memory_bytes'] / 1e9:.1f} GB" if "memory_bytes" in machine else None
-    cores = f"{machine['cores']} cores" if "cores" in machine else None
-    parts = [machine.get("processor"), cores, memory, machine.get("system")]
-    return ", ".join(str(part) for part in parts if part)
 
 
 _FIGURES: tuple[tuple[str, str, str, Callable[[ReviewedRun], Any]], ...] = (
@@ -244,7 +236,7 @@ _FIGURES: tuple[tuple[str, str, str, Callable[[ReviewedRun], Any]], ...] = (
 
 
 def figures_of(run: ReviewedRun) -> dict[str, tuple[str, str, bytes]]:
-    """By file name (without ending): title, what is seen, PNG; only what says something."""
+    """Title, sentence and PNG of each figure with content, by file name without ending."""
     found = {}
     for name, title, text, draw in _FIGURES:
         figure = draw(run)
@@ -254,7 +246,7 @@ def figures_of(run: ReviewedRun) -> dict[str, tuple[str, str, bytes]]:
 
 
 def panels_page(run: ReviewedRun) -> str | None:
-    """The page, ``None`` if the bag of the run has nothing that a panel draws.
+    """The page of panels, ``None`` if the bag of the run has no data for one.
 
     Raises:
         EnvironmentFault: if the bag is damaged.
@@ -275,12 +267,12 @@ def panels_page(run: ReviewedRun) -> str | None:
 
 
 def _in_script(content: Any) -> str:
-    """JSON that does not end the script which holds it."""
+    """JSON for an HTML script: it cannot contain the script's end tag."""
     return json.dumps(content).replace("</", "<\\/")
 
 
 def _panels(name: str, topic: RecordedTopic, start_ns: int) -> Iterator[dict[str, Any]]:
-    """What the page draws of an output."""
+    """The panels of an output."""
     if not topic.count:
         return
     if topic.type == SPIKES:
@@ -324,10 +316,10 @@ def _compressed(data: bytes) -> str:
 def world_pages(
     run: ReviewedRun, complain: Callable[[str], object] = lambda _: None
 ) -> dict[str, str]:
-    """Pages by node, of those whose world was recorded.
+    """Pages of recorded worlds, by node.
 
     Args:
-        complain: told of each file that is damaged; what comes before the damage is shown.
+        complain: called with a sentence about each damaged file; its world ends at the damage.
     """
     scripts = {key: (_SCRIPTS / name).read_text("utf-8") for key, name in _WORLD_SCRIPTS.items()}
     found = {}
@@ -341,7 +333,7 @@ def world_pages(
 
 
 def _scenes(file: Path, complain: Callable[[str], object]) -> Iterator[dict[str, Any]]:
-    """Each geometry, with the times and poses of its frames; what stood still is left out."""
+    """Each geometry that has frames, with their times and poses."""
     world = _World()
     try:
         for line in read_bytes(file).splitlines():
@@ -361,16 +353,16 @@ def _scenes(file: Path, complain: Callable[[str], object]) -> Iterator[dict[str,
             }
 
 
-# What comes of values of another type or length than a line should have.
+# Errors of lines that no node writes.
 _DAMAGE = (ValueError, TypeError, LookupError, OverflowError, RecursionError)
 
 
 class _World:
-    """A recorded world, from the lines of its file.
+    """A recorded world.
 
     Attributes:
-        scenes: each geometry, with times in seconds and poses; where the simulation was reset, time
-            goes on.
+        scenes: each geometry, with the times in seconds and poses of its frames. Times go on rising
+            where the simulation was reset.
     """
 
     def __init__(self) -> None:
@@ -378,27 +370,25 @@ class _World:
         self._before_s, self._last_s = 0.0, -1.0
 
     def add(self, line: bytes) -> None:
-        """Add what a line has. Raises one of ``_DAMAGE`` where that is not what a node writes."""
+        """Add a line of the file. Raises one of ``_DAMAGE`` for a line that no node writes."""
         content = json.loads(line)
         if "geometry" in content:
             geometry = json.loads(content["geometry"])
-            # Else the page could not be written, or not be read by JavaScript (NaN).
+            # The page could not hold other values, or JavaScript not read them (NaN).
             json.dumps([[[geometry]]], allow_nan=False)
             if not isinstance(geometry, dict):
                 raise TypeError("a geometry is an object")
             self.scenes.append((geometry, []))
         for _, sim_s, poses in content["frames"]:
-            self._add_frame(sim_s, base64.b64decode(poses, validate=True))
-
-    def _add_frame(self, sim_s: float, poses: bytes) -> None:
-        frames = self.scenes[-1][1]
-        if len(poses) % 4 or (frames and len(poses) != len(frames[0][1])):
-            raise ValueError("poses are 32-bit numbers, of the same bodies in all frames")
-        if self._before_s + sim_s < self._last_s:
-            self._before_s = self._last_s
-        time_s = self._before_s + sim_s
-        if not math.isfinite(time_s):
-            raise ValueError("times are finite")
-        if time_s > self._last_s or not frames:
-            self._last_s = time_s
-            frames.append((time_s, poses))
+            poses = base64.b64decode(poses, validate=True)
+            frames = self.scenes[-1][1]
+            if len(poses) % 4 or (frames and len(poses) != len(frames[0][1])):
+                raise ValueError("poses are 32-bit numbers, of the same bodies in all frames")
+            if self._before_s + sim_s < self._last_s:
+                self._before_s = self._last_s
+            time_s = self._before_s + sim_s
+            if not math.isfinite(time_s):
+                raise ValueError("times are finite")
+            if time_s > self._last_s or not frames:
+                self._last_s = time_s
+                frames.append((time_s, poses))

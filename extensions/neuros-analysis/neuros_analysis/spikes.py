@@ -1,7 +1,7 @@
 """Recorded spikes for Neo, and as files of Neurodata Without Borders.
 
-Times are seconds of simulated time. A span without spikes is part of the recording, too: trains
-begin where the first packet's span does at the latest, and end with the stamp of the last packet.
+Times are seconds of simulated time. Spans without spikes belong to the recording: trains begin at
+the latest with the span of the first packet, and end with the stamp of the last packet.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def segment(topic: RecordedTopic) -> Any:
-    """What :meth:`RecordedTopic.neo` returns."""
+    """The result of :meth:`RecordedTopic.neo`."""
     neo = library("neo", "array()")
     trains = trains_of(topic)
     made = neo.Segment(name=topic.name, topic=topic.name, connection=topic.connection or "")
@@ -38,7 +38,7 @@ def segment(topic: RecordedTopic) -> Any:
 def write_nwb(
     topic: RecordedTopic, file: str | os.PathLike[str], run_id: str, start_ns: int
 ) -> None:
-    """What :meth:`RecordedTopic.nwb` does."""
+    """The work of :meth:`RecordedTopic.nwb`."""
     pynwb = library("pynwb", "neo()")
     trains = trains_of(topic)
     began = datetime.fromtimestamp(start_ns / 1e9, timezone.utc)
@@ -55,8 +55,8 @@ class SpikeTrains:
     """The spikes of a recorded population.
 
     Attributes:
-        times_s: by neuron, the times of its spikes, rising.
-        start_s, end_s: what was recorded.
+        times_s: rising spike times of each neuron.
+        start_s, end_s: the recorded span.
     """
 
     times_s: list[Floats]
@@ -68,8 +68,8 @@ def trains_of(topic: RecordedTopic) -> SpikeTrains:
     """The spikes of a topic.
 
     Raises:
-        UsageError: if its type is another one, it has no packet, the size of the population
-            changes, or a packet has a neuron outside of it or not one time for each sender.
+        UsageError: the topic has another type or no packet, the size of the population changes,
+            or a packet has a neuron outside of it or not one time for each sender.
     """
     if topic.type != SPIKES:
         raise UsageError(f"{topic.name} has packets of {topic.type}: spike trains need {SPIKES}")
@@ -78,7 +78,11 @@ def trains_of(topic: RecordedTopic) -> SpikeTrains:
     if not len(sizes):
         raise UsageError(f"{topic.name} has no packet, so the size of its population is unknown")
     size = int(sizes[0])
-    senders, times = (_joined(columns[name]) for name in ("senders", "times"))
+    # A column has a row per packet, or an object where packets differ in length.
+    senders, times = (
+        np.concatenate([np.asarray(each, np.float64).ravel() for each in columns[name]])
+        for name in ("senders", "times")
+    )
     if np.any(sizes != size):
         raise UsageError(f"{topic.name}: the population has {size} neurons, then {sizes.max()}")
     if len(senders) != len(times):
@@ -91,9 +95,3 @@ def trains_of(topic: RecordedTopic) -> SpikeTrains:
     order = np.lexsort((times, senders))
     places = np.searchsorted(senders[order], np.arange(1, size))
     return SpikeTrains(np.split(times[order], places), start_s, end_s)
-
-
-def _joined(column: npt.NDArray[Any]) -> Floats:
-    """The elements of all packets: a row each, or objects where they have different lengths."""
-    parts = [np.asarray(each, np.float64).ravel() for each in column]
-    return np.concatenate(parts) if parts else np.zeros(0)

@@ -36,16 +36,16 @@ from neuros.registry import AUTO, BACK_ENDS, EXECUTORS
 from neuros_analysis.options import SweepOptions
 
 _PLAN_NAME = "sweep.json"
-_LOCK_NAME = ".sweep.lock"  # there while a sweep goes on
-_STOP_NAME = ".sweep.stop"  # there from when a sweep was ended until it goes on
+_LOCK_NAME = ".sweep.lock"  # locked while a sweep goes on
+_STOP_NAME = ".sweep.stop"  # exists from the interruption of a sweep until its continuation
 CSV_NAME = "sweep.csv"
-_HEED_S = 1.0
-_PAUSE_PER_WRITING = 100.0  # so that a table of any length takes 1 % of a core
+_WAIT_S = 1.0
+_PAUSE_PER_WRITING = 100.0  # writing the table uses at most 1 % of a core, however long it is
 _OF_EACH_RUN = ("backend", "duration", "record")
 _REASON_CHARACTERS = 50
 _COUNTS = (": sent", ": consumed")
 _MOST_CHARACTERS = 80
-# Columns of the table that are none of a value.
+# Columns of the table that do not hold a value of the sweep.
 _TAKEN = {
     *("seed", "repeat", "exit_code", "reason"),
     *("wall_s", "sim_s", "real_time_factor", "folder"),
@@ -54,13 +54,12 @@ _OPENING, _CLOSING = "[{", "]}"
 
 
 class Sweep:
-    """A sweep that is over, or as far as it has come.
+    """A finished or interrupted sweep.
 
     Attributes:
         folder: with a folder for each run, and the table, ``sweep.csv``.
-        rows: one for each run: its values, ``seed``, ``exit_code``, ``reason``, times, of each
-            connection how many packets were sent and consumed, also as a share, what nodes
-            found out (``node.set_result``), and its ``folder``.
+        rows: one per run: its values, ``seed``, ``exit_code``, ``reason``, times, sent and consumed
+            packets of each connection, results of nodes (``node.set_result``), and ``folder``.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -79,7 +78,20 @@ class Sweep:
         return [Run(folder) for folder in folders if (folder / RUN_FILE).exists()]
 
     def __str__(self) -> str:
-        return _table_of(self.rows)
+        hidden = ("folder", "wall_s", "sim_s")
+        names = [
+            name
+            for name in _columns_of(self.rows)
+            if name not in hidden
+            and not name.endswith(_COUNTS)
+            and not all(isinstance(row.get(name), (list, dict, type(None))) for row in self.rows)
+        ]
+        text: str = tabulate(
+            [[_cell(name, row.get(name)) for name in names] for row in self.rows],
+            headers=[name.replace(": ", "\n").replace(" -> ", "\n-> ") for name in names],
+            disable_numparse=True,
+        )
+        return text
 
     def __repr__(self) -> str:
         return f"<Sweep of {len(self.rows)} runs in {self.folder}>"
@@ -89,13 +101,14 @@ class Sweep:
 def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> Sweep:
     """Run a project with every combination of values, seeds and repetitions.
 
-    What has finished in ``output`` already is not run again, so that a sweep can be gone on with.
-    A run that fails is a row like the others. ``KeyboardInterrupt`` ends the runs that go on;
-    what has finished is in the table on the disk. This process reads no run folder but those of an
-    earlier call: a job sends the row of its run.
+    Runs that have finished in ``output`` are not repeated, so a sweep can be continued. A failed
+    run is a row like the others. ``KeyboardInterrupt`` ends all runs; the table on the disk has
+    the finished ones. Each job sends the row of its run: this process only reads run folders of
+    earlier calls.
 
-    ``set`` has, by path as in ``--set``, a list of values or a single one. Runs have the other
-    options of :meth:`~neuros.api.project.Project.run`.
+    ``set`` has a value or a list of values for each path of ``--set``. Runs have the other
+    options of
+    :meth:`~neuros.api.project.Project.run`.
 
     Raises:
         ProjectError: if the project is not valid with all values; nothing has been run then.
@@ -111,7 +124,7 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
         raise UsageError(f"jobs {options.jobs}: give 1 or more")
     request = Request(backend=options.backend, duration=options.duration, record=options.record)
     if (back_end := request.backend or AUTO) != AUTO:
-        BACK_ENDS.load(back_end)  # else each run would be refused, in a folder that names it
+        BACK_ENDS.load(back_end)  # raises here once, not in each run
     resources = _check_all(project, points, request)
     folder = _sweep_folder(project, options)
     with _locked_folder(folder):
@@ -121,7 +134,12 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
 def _values(given: Mapping[str, Any] | Sequence[str] | None) -> dict[str, list[Any]]:
     """The values of each path, from Python or as texts of ``--set``."""
     if isinstance(given, Mapping):
-        return {path: _as_list(each) for path, each in given.items()}
+        return {
+            path: [each]
+            if isinstance(each, (str, bytes, Mapping)) or not hasattr(each, "__iter__")
+            else list(each)
+            for path, each in given.items()
+        }
     values: dict[str, list[Any]] = {}
     for text in given or ():
         path, listed = parse_values(text)
@@ -169,7 +187,7 @@ class _Sweeping:
     def run(self, resources: JobResources) -> Sweep:
         folder, options = self._sweep.folder, self._options
         (folder / _STOP_NAME).unlink(missing_ok=True)
-        waiting = [name for name in self._jobs if not self._take_finished(name)]
+        waiting = [name for name in self._jobs if not self._has_finished(name)]
         try:
             if waiting:
                 plan = SweepPlan(self._name, folder, options.jobs, resources, "neuros-analysis")
@@ -180,34 +198,40 @@ class _Sweeping:
         return self._sweep
 
     def _execute(self, jobs: Jobs, waiting: Sequence[str]) -> None:
-        """Have the runs made, and note each as soon as it has ended."""
+        """Submit the runs, and add a row as soon as a run has ended."""
         ended: SimpleQueue[Future[Any]] = SimpleQueue()
         futures: dict[Future[Any], str] = {}
-        noted = 0
+        count = 0
         try:
             submitted = jobs.submit([self._jobs[name] for name in waiting])
             futures |= zip(submitted, waiting, strict=True)
             for future in futures:
                 future.add_done_callback(ended.put)
-            while noted < len(futures):
-                # Python does not see a Ctrl+C that comes just before it waits, until it has waited.
+            while count < len(futures):
+                # Python handles a Ctrl+C that comes just before a wait only after it.
                 with contextlib.suppress(Empty):
-                    future = ended.get(timeout=_HEED_S)
-                    noted += 1
-                    self._note(futures[future], future)
+                    future = ended.get(timeout=_WAIT_S)
+                    count += 1
+                    name = futures[future]
+                    if self._receive_row(name, future):
+                        if time.monotonic() >= self._next_save_s:
+                            self._save()
+                        if self._options.on_row is not None:
+                            total = len(self._points)
+                            self._options.on_row(len(self._rows), total, self._rows[name])
         except BaseException:
-            # Wherever they are: jobs look for it.
+            # Jobs on other machines watch for this file.
             (self._sweep.folder / _STOP_NAME).touch()
             jobs.cancel()
             wait(futures)
             for future, name in futures.items():
-                self._take(name, future)
+                self._receive_row(name, future)
             raise
 
-    def _take_finished(self, name: str) -> bool:
-        """Whether this was run before; what is to be made again is set aside."""
+    def _has_finished(self, name: str) -> bool:
+        """Add the row of a run of an earlier call; set a run aside that must be repeated."""
         job = self._jobs[name]
-        # Without a record it may go on: its job sees to it.
+        # Without a record the run may go on: its job handles that.
         if not (job.folder / RUN_FILE).exists():
             return False
         run = finished_run(job.folder)
@@ -217,8 +241,8 @@ class _Sweeping:
         set_aside(job.folder, "failed" if run else "unfinished")
         return False
 
-    def _take(self, name: str, future: Future[Any]) -> bool:
-        """Whether a job has brought a row."""
+    def _receive_row(self, name: str, future: Future[Any]) -> bool:
+        """Add the row of a job; False if the job has none."""
         job = self._jobs[name]
         if future.cancelled():
             return False
@@ -228,20 +252,19 @@ class _Sweeping:
             self._rows[name] = row
         return row is not None
 
-    def _note(self, name: str, future: Future[Any]) -> None:
-        if not self._take(name, future):
-            return
-        if time.monotonic() >= self._next_save_s:
-            self._save()
-        if self._options.on_row is not None:
-            self._options.on_row(len(self._rows), len(self._points), self._rows[name])
-
     def _save(self) -> None:
-        """Write the table; how long that takes says how soon it may be written again."""
+        """Write the table atomically; the pause until the next writing grows with the duration."""
         started_s = time.monotonic()
         self._sweep.rows = [self._rows[name] for name in self._points if name in self._rows]
         try:
-            _write_csv(self._sweep.rows, self._sweep.folder)
+            text = io.StringIO(newline="")
+            columns = _columns_of(self._sweep.rows)
+            writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(self._sweep.rows)
+            new = self._sweep.folder / f"{CSV_NAME}.new"
+            new.write_text(text.getvalue(), "utf-8")
+            os.replace(new, self._sweep.folder / CSV_NAME)
         except OSError as error:
             file = self._sweep.folder / CSV_NAME
             raise EnvironmentFault(f"{file} cannot be written ({error.strerror})") from error
@@ -249,13 +272,8 @@ class _Sweeping:
         self._next_save_s = now_s + _PAUSE_PER_WRITING * (now_s - started_s)
 
 
-def _as_list(given: Any) -> list[Any]:
-    is_one = isinstance(given, (str, bytes, Mapping)) or not hasattr(given, "__iter__")
-    return [given] if is_one else list(given)
-
-
 def _check_all(project: Project, points: Sequence[Point], request: Request) -> JobResources:
-    """Check the project with every point; returns what is enough for each of its runs.
+    """Check the project with every point; returns resources that suffice for each run.
 
     Raises ``ProjectError`` with all problems.
     """
@@ -274,7 +292,7 @@ def _check_all(project: Project, points: Sequence[Point], request: Request) -> J
 
 
 def _sweep_folder(project: Project, options: SweepOptions) -> Path:
-    """The sweep's folder, new or that of an earlier part of it. Raises ``UsageError``."""
+    """The folder of a new sweep, or of the one to continue. Raises ``UsageError``."""
     stamp = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
     folder = Path(options.output or Path("runs", project.name, f"sweep-{stamp}")).absolute()
     plan = {
@@ -285,7 +303,15 @@ def _sweep_folder(project: Project, options: SweepOptions) -> Path:
     file = folder / _PLAN_NAME
     try:
         if file.exists():
-            _check_same(read_object(file), plan, folder)
+            before = read_object(file)
+            for name, value in plan.items():
+                if before.get(name) != value:
+                    is_text = name == "project_sha256"
+                    what = "the project's files differ" if is_text else f"its {name} differs"
+                    raise UsageError(
+                        f"{folder} holds a sweep that is not this one ({what}): name another"
+                        " folder with -o"
+                    )
             return folder
         if folder.exists() and any(folder.iterdir()):
             raise UsageError(f"{folder}: is neither empty nor a sweep; name another folder with -o")
@@ -298,7 +324,10 @@ def _sweep_folder(project: Project, options: SweepOptions) -> Path:
 
 @contextlib.contextmanager
 def _locked_folder(folder: Path) -> Iterator[None]:
-    """Keep others from the folder: to them, runs that go on are cut off. Raises ``UsageError``."""
+    """Lock the folder against other sweeps, which would take its runs for cut off.
+
+    Raises ``UsageError``.
+    """
     with contextlib.ExitStack() as stack:
         try:
             is_alone = stack.enter_context(locked(folder / _LOCK_NAME, wait=False))
@@ -311,49 +340,11 @@ def _locked_folder(folder: Path) -> Iterator[None]:
         yield
 
 
-def _check_same(before: Mapping[str, Any], now: Mapping[str, Any], folder: Path) -> None:
-    for name, value in now.items():
-        if before.get(name) != value:
-            is_text = name == "project_sha256"
-            what = "the project's files differ" if is_text else f"its {name} differs"
-            raise UsageError(
-                f"{folder} holds a sweep that is not this one ({what}): name another folder with -o"
-            )
-
-
 def _columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The columns of all rows; that of the folder is the last."""
+    """The columns of all rows; the folder is the last."""
     found = dict.fromkeys(name for row in rows for name in row)
     found.pop("folder", None)
     return [*found, "folder"]
-
-
-def _write_csv(rows: Sequence[Mapping[str, Any]], folder: Path) -> None:
-    """Write ``sweep.csv``; a reader never finds half of it. Raises ``OSError``."""
-    text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, _columns_of(rows), restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    new = folder / f"{CSV_NAME}.new"
-    new.write_text(text.getvalue(), "utf-8")
-    os.replace(new, folder / CSV_NAME)
-
-
-def _table_of(rows: Sequence[Mapping[str, Any]]) -> str:
-    """For people: without folders, times and counts."""
-    hidden = ("folder", "wall_s", "sim_s")
-    names = [n for n in _columns_of(rows) if n not in hidden and not n.endswith(_COUNTS)]
-    names = [name for name in names if any(_is_shown(row.get(name)) for row in rows)]
-    table: str = tabulate(
-        [[_cell(name, row.get(name)) for name in names] for row in rows],
-        headers=[name.replace(": ", "\n").replace(" -> ", "\n-> ") for name in names],
-        disable_numparse=True,
-    )
-    return table
-
-
-def _is_shown(value: Any) -> bool:
-    return value is not None and not isinstance(value, (list, dict))
 
 
 def _cell(name: str, value: Any) -> str:
@@ -376,7 +367,7 @@ class LocalExecutor(SweepExecutor):
     name = "local"
 
     def open(self, place: str | None, plan: SweepPlan) -> Executor:
-        # A run is processes of its own: its launcher has enough with a thread.
+        # A run has its own processes: a thread is enough for its launcher.
         return ThreadPoolExecutor(plan.count or 1, thread_name_prefix="neuros-sweep")
 
 
@@ -393,12 +384,12 @@ class _PoolJobs:
         return [self._pool.submit(job) for job in jobs]
 
     def cancel(self) -> None:
-        """Nothing: a job that begins now returns at once."""
+        """Jobs that begin now find the stop file, and return at once."""
 
 
 @contextlib.contextmanager
 def open_executor(wanted: str | Executor, plan: SweepPlan) -> Iterator[Jobs]:
-    """The executor that is asked for: ``NAME``, ``NAME=PLACE``, or a pool of the caller's own.
+    """The executor for ``NAME``, ``NAME=PLACE``, or a pool of the caller's own.
 
     Raises ``UsageError`` and ``EnvironmentFault``.
     """
@@ -425,8 +416,8 @@ class Point:
 
     Attributes:
         settings: values by path.
-        seed: for all nodes that have one, ``None``: as in the files.
-        repeat: which repetition it is, from 1; ``None`` where there is one only.
+        seed: for all nodes with a seed; ``None``: as in the files.
+        repeat: number of the repetition, from 1; ``None`` without repetitions.
     """
 
     settings: Mapping[str, Any]
@@ -434,13 +425,13 @@ class Point:
     repeat: int | None = None
 
     def values(self, names: Mapping[str, str]) -> dict[str, Any]:
-        """What tells it from others; ``names``: of the columns, by path."""
+        """The values that identify the point; ``names``: columns by path."""
         found = {names[path]: value for path, value in self.settings.items()}
         found |= {} if self.seed is None else {"seed": self.seed}
         return found | ({} if self.repeat is None else {"repeat": self.repeat})
 
     def folder_name(self, names: Mapping[str, str]) -> str:
-        """A name for its folder: readable, and never that of another point."""
+        """A readable folder name, different for each point."""
         settings = sorted((path, value_text(path, v)) for path, v in self.settings.items())
         identity = (settings, self.seed, self.repeat)
         digest = hashlib.sha256(json.dumps(identity).encode()).hexdigest()[:8]
@@ -451,10 +442,10 @@ class Point:
 def points_of(
     values: Mapping[str, Sequence[Any]], seeds: Sequence[int], repeat: int
 ) -> list[Point]:
-    """The grid; what is named last changes first.
+    """All points of the grid; the last path changes first.
 
     Raises:
-        UsageError: if there is no value for something, or one twice.
+        UsageError: a path has no value, or a value twice.
     """
     if repeat < 1:
         raise UsageError(f"repeat {repeat}: give 1 or more")
@@ -475,7 +466,7 @@ def points_of(
 
 
 def short_names(paths: Sequence[str]) -> dict[str, str]:
-    """What to call paths: their last steps, as few as tell them apart."""
+    """Column names of paths: the fewest last steps that tell them apart."""
     names = {}
     for path in paths:
         steps = path.split(".")
@@ -487,16 +478,22 @@ def short_names(paths: Sequence[str]) -> dict[str, str]:
 
 
 def parse_values(text: str) -> tuple[str, list[Any]]:
-    """``PATH=1,2,3`` as on the command line: commas within brackets and quotes are no separators.
+    """Parse ``PATH=1,2,3``; commas within brackets and quotes do not separate.
 
     Raises:
-        UsageError: if it is not of this form.
+        UsageError: the text does not have this form.
     """
     path, equals, listed = text.partition("=")
     if not (path and equals):
         raise UsageError(f"--set {text}: is not of the form PATH=VALUE,VALUE,...")
     is_text = path.split(".")[2:3] == ["environment"]
-    return path, [part if is_text else _json_or_text(part) for part in _split(listed)]
+    values: list[Any] = []
+    for part in _split(listed):
+        try:
+            values.append(part if is_text else json.loads(part))
+        except ValueError:
+            values.append(part)
+    return path, values
 
 
 def _split(text: str) -> Iterator[str]:
@@ -512,36 +509,29 @@ def _split(text: str) -> Iterator[str]:
     yield text[start:]
 
 
-def _json_or_text(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
-
-
 # ---------------------------------------------------------------------- jobs
 #
-# One run of a sweep as a job, which is sent to an executor, and the row that comes back.
+# A run of a sweep as a job for an executor, and the row that the job returns.
 
 
-# A run that was interrupted, or could not write what it should, is made again.
+# Exit codes of runs that are not repeated: an interrupted one is, or one that could not write.
 _FINISHED = (0, 1, 5)
 SHARE = ": consumed / %"
-_LOOK_S = 0.25
+_POLL_S = 0.25
 
 
 @dataclass(frozen=True)
 class SweepJob:
-    """A run of a sweep. Calling it makes the run, wherever it was sent.
+    """A run of a sweep; the executor calls the job.
 
-    Several jobs of the same run do no harm, as after the front end of a sweep was killed, or where
-    Dask has taken a worker for lost: one makes it, and the others return its row.
+    Several jobs of one run do no harm, as after the death of a sweep's front end, or where Dask
+    assumes that a worker is lost: one job makes the run, and the others return its row.
 
     Attributes:
-        values: what the row begins with.
+        values: the first columns of the row.
         arguments: of :meth:`Project.start`.
         folder: of the run.
-        stop: a file; as soon as it is there, the run is ended, and none begins.
+        stop: a file; while it exists the run is ended, or does not begin.
     """
 
     project: Project
@@ -551,28 +541,31 @@ class SweepJob:
     stop: Path
 
     def __call__(self) -> dict[str, Any] | None:
-        """Make the run; returns its row, ``None`` if the sweep was ended before."""
+        """Make the run and return its row, ``None`` if the sweep was ended before."""
         try:
             with locked(self.folder.with_name(f".{self.folder.name}.lock")):
-                return None if self.stop.exists() else self._row_of_another() or self._make()
+                if self.stop.exists():
+                    return None
+                if self.folder.exists():
+                    if (run := finished_run(self.folder)) is not None:  # of another job
+                        return row_of(self.values, run)
+                    set_aside(self.folder)
+                return self._make()
         except (NeurosError, OSError) as error:
             return failed_row(self.values, error, self.folder)
-
-    def _row_of_another(self) -> dict[str, Any] | None:
-        """The row of the run if another job has made it; what is left of one is set aside."""
-        if not self.folder.exists():
-            return None
-        run = finished_run(self.folder)
-        if run is None:
-            set_aside(self.folder)
-        return None if run is None else row_of(self.values, run)
 
     def _make(self) -> dict[str, Any] | None:
         live: LiveRun | None = None
         try:
             live = self.project.start(**self.arguments, output=self.folder)
-            run = self._ended(live)
-        except KeyboardInterrupt:  # of a cluster that wants its machine back
+            run = None
+            while run is None and not self.stop.exists():
+                with contextlib.suppress(TimeoutError):
+                    run = live.wait(_POLL_S)
+            if run is None:
+                live.interrupt()
+                run = live.wait()
+        except KeyboardInterrupt:  # a cluster needs its machine
             if live is None:
                 raise
             live.end()
@@ -580,18 +573,9 @@ class SweepJob:
         is_cut_off = run.exit_code not in _FINISHED and self.stop.exists()
         return None if is_cut_off else row_of(self.values, run)
 
-    def _ended(self, live: LiveRun) -> Run:
-        while not self.stop.exists():
-            try:
-                return live.wait(_LOOK_S)
-            except TimeoutError:
-                continue
-        live.interrupt()
-        return live.wait()
-
 
 def finished_run(folder: Path) -> Run | None:
-    """The run that a folder holds, unless it was cut off."""
+    """The run of a folder, ``None`` if the run was cut off."""
     try:
         run = Run(folder)
     except NeurosError:
@@ -600,7 +584,7 @@ def finished_run(folder: Path) -> Run | None:
 
 
 def set_aside(folder: Path, why: str = "unfinished") -> None:
-    """Rename what a run has left that is made again."""
+    """Rename the folder of a run that must be repeated."""
     number = 1
     while (aside := folder.with_name(f"{folder.name}.{why}-{number}")).exists():
         number += 1
@@ -608,7 +592,7 @@ def set_aside(folder: Path, why: str = "unfinished") -> None:
 
 
 def row_of(values: Mapping[str, Any], run: Run) -> dict[str, Any]:
-    """What came of a run, behind the values that it was made with."""
+    """The row of a run: its values, then its results."""
     row = {
         **values,
         "exit_code": run.exit_code,
