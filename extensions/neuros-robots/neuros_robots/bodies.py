@@ -20,7 +20,7 @@ _INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0
 _TOLERANCE = 1e-9
 _NO_LIMIT = 1e15
 _UNLIMITED_ENDS = (-1e16, 1e16)
-# The kinds of joints in MuJoCo that each type consists of, by the element with its axis.
+# By type of joint: MuJoCo's joints that make it up, each with the element of its axis.
 _PARTS: dict[str, tuple[tuple[Any, str], ...]] = {
     "revolute": ((_HINGE, "axis"),),
     "continuous": ((_HINGE, "axis"),),
@@ -50,7 +50,7 @@ def add_body(building: Building, branch: Branch) -> None:
     if not link.is_static and not is_solid:
         _set_inertia(body, link.element, inertial)
     elif link.is_static and inertial is not None:
-        inertial.take_all()  # what never moves needs none
+        inertial.mark_all_read()  # a static body needs no inertia
     if not link.element.is_true("gravity", default=True):
         body.gravcomp = 1.0
     if branch.joint is not None:
@@ -80,7 +80,7 @@ def _set_inertia(body: Any, link: Element, inertial: Element | None) -> None:
 
 
 def _possible(matrix: Vector, element: Element) -> Vector:
-    """The matrix, or one that a rigid body can have."""
+    """The matrix, or a replacement if no rigid body has this inertia."""
     if not np.isfinite(matrix).all():
         element.problem("every moment of inertia must be finite")
         return np.eye(3)
@@ -124,7 +124,7 @@ def _direction(joint: Joint, tag: str) -> Vector:
 
 
 def _is_old(scope: Scope) -> bool:
-    """Whether axes are in the frame of the model, as they were until SDF 1.4."""
+    """Whether axes are in the frame of the model, as until SDF 1.4."""
     for element in scope.element.and_ancestors():
         version = element.attributes.get("_version") or (
             element.attributes.get("version", "") if element.tag == "sdf" else ""
@@ -136,7 +136,7 @@ def _is_old(scope: Scope) -> bool:
 
 
 def is_known(joint: Joint) -> bool:
-    """Whether there is such a type of joint; a problem is reported."""
+    """Whether the type of a joint is known; a problem is reported."""
     if joint.type in _PARTS:
         return True
     known = ", ".join(sorted(_PARTS))
@@ -145,12 +145,12 @@ def is_known(joint: Joint) -> bool:
 
 
 def _add_joints(building: Building, branch: Branch, joint: Joint) -> None:
-    """Add the joints between a body and the one that it hangs on."""
+    """Add the joints between a body and its parent."""
     body, link = building.body(branch.link), branch.link
     place = link.pose.inverse() @ joint.anchor
     parts, is_screw = _PARTS[joint.type], joint.type == "screw"
     names = building.joints[joint.name] = []
-    # MuJoCo moves a body by its joints in their order, the first one hangs on the parent.
+    # MuJoCo applies the joints of a body in their order, the first next to the parent.
     for kind, tag in reversed(parts) if branch.is_turned else parts:
         direction = _direction(joint, tag) if tag else None
         made = body.add_joint(type=kind, pos=place.position)
@@ -166,7 +166,19 @@ def _add_joints(building: Building, branch: Branch, joint: Joint) -> None:
             if axis is not None and not (is_screw and kind == _SLIDE):
                 _read_dynamics(axis, made, joint.type)
     if is_screw:
-        _couple_screw(building, joint.element, names)
+        # A soft constraint holds the hinge and the slide together.
+        element = joint.element
+        pitch = element.number("screw_thread_pitch", 0.0)
+        if element.child("screw_thread_pitch") is None:
+            # The older element: radians per metre, left-handed.
+            old = element.number("thread_pitch", 1.0)
+            pitch = -2 * math.pi / old if old else 0.0
+        turn = next(name for name in names if name.endswith("/turn"))
+        slide = next(name for name in names if name.endswith("/slide"))
+        _follow(building, slide, turn, 0.0, pitch / (2 * math.pi))
+        element.remark(
+            "a screw is a hinge and a slide, held together by a soft constraint in MuJoCo"
+        )
     if joint.type == "gearbox":
         joint.element.remark("a gearbox is a hinge without its gears in MuJoCo")
 
@@ -181,14 +193,14 @@ def _read_dynamics(axis: Element, joint: Any, joint_type: str) -> None:
         elif joint_type != "continuous" and (lower > -_NO_LIMIT or upper < _NO_LIMIT):
             lower, upper = max(lower, -_NO_LIMIT), min(upper, _NO_LIMIT)
             if lower == upper:
-                upper = math.nextafter(lower, math.inf)  # MuJoCo takes no empty range
+                upper = math.nextafter(lower, math.inf)  # MuJoCo refuses an empty range
             joint.range, joint.limited = [lower, upper], True
         effort = limit.number("effort", math.inf)
         if 0 < effort < _NO_LIMIT:
             joint.actfrcrange, joint.actfrclimited = [-effort, effort], True
         velocity = limit.child("velocity")
-        if velocity is not None:  # a limit that limits something is listed
-            velocity.taken = not 0 <= limit.number("velocity", -1) < _NO_LIMIT
+        if velocity is not None:  # an effective limit is listed as unsupported
+            velocity.is_read = not 0 <= limit.number("velocity", -1) < _NO_LIMIT
     dynamics = axis.child("dynamics")
     if dynamics is not None:
         joint.damping[0] = dynamics.number("damping", 0.0)
@@ -197,27 +209,14 @@ def _read_dynamics(axis: Element, joint: Any, joint_type: str) -> None:
         joint.springref = dynamics.number("spring_reference", 0.0)
 
 
-def _couple_screw(building: Building, element: Element, names: list[str]) -> None:
-    """A screw is a hinge and a slide of which the one follows the other."""
-    pitch = element.number("screw_thread_pitch", 0.0)
-    if element.child("screw_thread_pitch") is None:
-        # The old one: radians per metre, left-handed.
-        old = element.number("thread_pitch", 1.0)
-        pitch = -2 * math.pi / old if old else 0.0
-    turn = next(name for name in names if name.endswith("/turn"))
-    slide = next(name for name in names if name.endswith("/slide"))
-    _follow(building, slide, turn, 0.0, pitch / (2 * math.pi))
-    element.remark("a screw is a hinge and a slide, held together by a soft constraint in MuJoCo")
-
-
 def _follow(building: Building, joint: str, leader: str, offset: float, ratio: float) -> None:
-    """Let the position of one joint be ``offset`` + ``ratio`` times that of another."""
+    """Constrain the position of a joint to ``offset`` + ``ratio`` times that of another."""
     equality = follow_joint(building.spec, joint, leader, offset, ratio)
     equality.name = building.name("equality", f"{joint} follows {leader}", None)
 
 
 def follow_joint(spec: Any, joint: str, leader: str, offset: float, ratio: float) -> Any:
-    """Add the constraint to a spec, without a name of its own; returns it."""
+    """Add the constraint to a spec, without a name; returns it."""
     return _add_equality(
         spec, mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT, (joint, leader), [offset, ratio]
     )
@@ -243,7 +242,7 @@ def add_mimics(building: Building, scope: Scope) -> None:
             mine = building.joints.get(inner.prefix + element.name, [])
             theirs = building.joints.get(inner.prefix + leader.replace("::", "/"), [])
             if len(mine) != 1 or len(theirs) != 1:
-                mimic.note(f"'{leader}' and this joint must have one axis each for MuJoCo")
+                mimic.omit(f"'{leader}' and this joint must have one axis each for MuJoCo")
                 continue
             ratio = mimic.number("multiplier", 1.0)
             offset = mimic.number("offset", 0.0)
@@ -258,7 +257,7 @@ def close_loop(building: Building, joint: Joint) -> None:
         case "fixed":
             _hold(building, joint, _WELD, point)
         case "revolute" | "continuous":
-            # Held at two points of its axis, it can turn about nothing else.
+            # Held at two points of its axis, the body can only turn about the axis.
             direction = _direction(joint, "axis")
             for end, name in ((-_HALF_HINGE_M, "/1"), (_HALF_HINGE_M, "/2")):
                 _hold(building, joint, _CONNECT, point + end * direction, name)
@@ -266,18 +265,18 @@ def close_loop(building: Building, joint: Joint) -> None:
             _hold(building, joint, _CONNECT, point)
         case "universal":
             _hold(building, joint, _CONNECT, point)
-            joint.element.note(f"{_SOFT}; it may turn about the third axis, too")
+            joint.element.omit(f"{_SOFT}; it may turn about the third axis, too")
             return
         case _:
-            joint.element.note(f"closes a loop, and MuJoCo has no {joint.type} constraint")
+            joint.element.omit(f"closes a loop, and MuJoCo has no {joint.type} constraint")
             return
-    joint.element.note(f"{_SOFT}: without limits, friction and damping")
+    joint.element.omit(f"{_SOFT}: without limits, friction and damping")
 
 
 def _hold(building: Building, joint: Joint, kind: object, point: Vector, suffix: str = "") -> None:
     first, second = joint.child or joint.parent, joint.parent if joint.child else None
     names = building.body(first).name, building.body(second).name if second else "world"
-    # As much against turning as against moving; the pose is the present one.
+    # The weight of torque against force is 1; the zero pose means the present one.
     data: Any = [*[0.0] * 10, 1.0]
     if kind == _CONNECT and first is not None:
         data = first.pose.inverse().rotation @ (point - first.pose.position)
@@ -286,11 +285,11 @@ def _hold(building: Building, joint: Joint, kind: object, point: Vector, suffix:
 
 
 def add_actuators(building: Building, scope: Scope) -> None:
-    """An actuator for every joint controller of Gazebo's in a model and those in it.
+    """Add an actuator for every joint controller of Gazebo's in a model and its nested models.
 
     ``JointPositionController`` is a PD controller, which is a ``position`` actuator;
-    ``JointController`` holds a velocity, which is a ``velocity`` actuator. Every other plugin is
-    code that runs inside Gazebo, and is listed.
+    ``JointController`` holds a velocity, which is a ``velocity`` actuator. Other plugins are code
+    that runs inside Gazebo, and are listed.
     """
     plugins = [
         (inner, plugin, plugin.name.rpartition("::")[2])
@@ -313,11 +312,19 @@ def add_actuators(building: Building, scope: Scope) -> None:
             actuator.name = building.name("actuator", joints[0], plugin)
             actuator.target = joints[0]
             _set_gains(actuator, plugin, kind)
-        _read_rest(plugin, kind)
+        if plugin.number("i_gain", 0.0) == 0:
+            for tag in ("i_gain", "i_max", "i_min"):
+                plugin.child(tag)
+        else:
+            plugin.remark("without the integral part: MuJoCo's servos have P and D")
+        for tag in ("cmd_offset", *(["d_gain"] if kind == _VELOCITY else [])):
+            child = plugin.child(tag)
+            if child is not None and plugin.number(tag, 0.0) != 0:
+                child.is_read = False  # effective in Gazebo, so listed as unsupported
 
 
 def _set_gains(actuator: Any, plugin: Element, kind: str) -> None:
-    plugin.taken = True
+    plugin.is_read = True
     gain = plugin.number("p_gain", 1.0 if kind == _POSITION else _STIFF_GAIN)
     if kind == _POSITION:
         actuator.set_to_position(kp=gain, kv=max(0.0, plugin.number("d_gain", 0.1)))
@@ -329,15 +336,3 @@ def _set_gains(actuator: Any, plugin: Element, kind: str) -> None:
     most = plugin.number("cmd_max", math.inf)
     if least < most and not (math.isinf(least) and math.isinf(most)):
         actuator.forcerange, actuator.forcelimited = [max(least, -1e15), min(most, 1e15)], True
-
-
-def _read_rest(plugin: Element, kind: str) -> None:
-    if plugin.number("i_gain", 0.0) == 0:
-        for tag in ("i_gain", "i_max", "i_min"):
-            plugin.child(tag)
-    else:
-        plugin.remark("without the integral part: MuJoCo's servos have P and D")
-    for tag in ("cmd_offset", *(["d_gain"] if kind == _VELOCITY else [])):
-        child = plugin.child(tag)
-        if child is not None and plugin.number(tag, 0.0) != 0:
-            child.taken = False  # it has an effect in Gazebo, and is listed

@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.errors import DescriptionError, EnvironmentFault, Problem, UsageError
 
 if TYPE_CHECKING:
-    from neuros_robots.elements import NotTaken
     from neuros_robots.mjcf import Converted
 
 _EPILOG = """\
@@ -65,13 +63,20 @@ def _convert(options: argparse.Namespace) -> int:
         text = f"MuJoCo cannot read its own output: {text}"
         problem = Problem(str(source), 1, 1, "/", text)
         raise DescriptionError([problem]) from error
-    if converted.not_taken:
-        print(_table(converted.not_taken), end="\n\n")
+    if converted.differences:
+        from tabulate import tabulate
+
+        rows = [
+            [note.place, note.path, f"{note.count} x" if note.count > 1 else "", note.why]
+            for note in converted.differences
+        ]
+        headers = ["where", "what", "", "reason, or what is different"]
+        print(tabulate(rows, headers=headers, disable_numparse=True), end="\n\n")
     made = len(files) - 1
     meshes = f", {made} mesh{'' if made == 1 else 'es'} beside it" if made else ""
     print(f"{output}: bodies: {converted.bodies}, joints: {converted.joints}{meshes}")
-    if converted.not_taken:
-        count = sum(note.count for note in converted.not_taken)
+    if converted.differences:
+        count = sum(note.count for note in converted.differences)
         things = "1 thing was" if count == 1 else f"{count} things were"
         text = f"warning: {things} not converted, or converted differently: see the table"
         print(text, file=sys.stderr)
@@ -110,14 +115,3 @@ def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
             raise UsageError(f"-I {folder}: there is no such folder")
     convert = read_urdf if source.suffix.lower() == ".urdf" else convert_sdf
     return convert(source, finder(folders, os.environ)), source, output
-
-
-def _table(notes: Sequence[NotTaken]) -> str:
-    from tabulate import tabulate
-
-    rows = [
-        [note.place, note.path, f"{note.count} x" if note.count > 1 else "", note.why]
-        for note in notes
-    ]
-    headers = ["where", "what", "", "reason, or what is different"]
-    return str(tabulate(rows, headers=headers, disable_numparse=True))

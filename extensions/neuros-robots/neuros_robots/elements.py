@@ -1,6 +1,6 @@
-"""XML elements of a description, the files that it names, and the report of what is never read.
+"""XML elements of a description, the files that it names, and the report of unread elements.
 
-Files are named by URIs, which are ``model://``, ``package://``, ``file://``, or by a path.
+Files are named by URIs (``model://``, ``package://``, ``file://``) or paths.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ PATH_VARIABLES = (
 _REMOTE = ("http://", "https://", "fuel://")
 _MOST_BYTES = 64 << 20
 _MOST_ELEMENTS = 200_000
-_FILE_ELEMENTS = 20  # what it costs to open a file, in elements
+_FILE_ELEMENTS = 20  # the cost of opening a file, in elements
 DEEPEST = 50
-"""Levels of models within models, and twice that many of elements in a file."""
+"""Most levels of models within models, and twice that of elements in a file."""
 _UNKNOWN = "the converter does not know this element"
 _EXTENSION = "an extension of its author's own"
 _TAGS_BY_REASON: Mapping[str, str] = {
@@ -88,14 +88,14 @@ _REASONS = {tag: reason for reason, tags in _TAGS_BY_REASON.items() for tag in t
 
 
 @dataclass(frozen=True)
-class NotTaken:
-    """Something in a description that the result does not have, or has otherwise.
+class Difference:
+    """A part of a description that the result lacks, or has in another form.
 
     Attributes:
         place: ``file:line`` of the first one.
         path: its path in the document.
         why: the reason, in words.
-        count: how many of its kind there are, for this reason.
+        count: number of elements of this kind with this reason.
     """
 
     place: str
@@ -109,7 +109,7 @@ class NotTaken:
 
 
 class Report:
-    """Problems and notes of one conversion; the elements of all its documents add to it."""
+    """Problems and notes of one conversion, from the elements of all its documents."""
 
     def __init__(self) -> None:
         self.problems: list[Problem] = []
@@ -120,36 +120,36 @@ class Report:
         """Count elements of a file.
 
         Raises:
-            DescriptionError: if they are too many. Files can include each other so often that
-                nobody could read to the end.
+            DescriptionError: there are too many in all files. Files can include each other so
+                often that reading would never end.
         """
         self._elements += elements
         if self._elements > _MOST_ELEMENTS:
             text = f"with it the description has more than {_MOST_ELEMENTS} elements"
             raise DescriptionError([Problem(display_name(file), 1, 1, "/", text)])
 
-    def note_unread(self, roots: Iterable[Element]) -> None:
+    def omit_unread(self, roots: Iterable[Element]) -> None:
         """Note the topmost elements that were not read."""
         for root in roots:
             for child in root.children:
-                if not child.taken:
+                if not child.is_read:
                     is_extension = ":" in child.tag
-                    child.note(_EXTENSION if is_extension else _REASONS.get(child.tag, _UNKNOWN))
-            self.note_unread(root.children)
+                    child.omit(_EXTENSION if is_extension else _REASONS.get(child.tag, _UNKNOWN))
+            self.omit_unread(root.children)
 
     def raise_any(self) -> None:
         """Raise ``DescriptionError`` with all problems, if there are any."""
         if self.problems:
             raise DescriptionError(self.problems)
 
-    def not_taken(self) -> Sequence[NotTaken]:
-        """The notes in the order of their places; equal ones of one kind are one."""
+    def differences(self) -> Sequence[Difference]:
+        """The notes in the order of their places; equal ones are counted together."""
         notes = sorted(self.notes, key=lambda note: (str(note[0].file), note[0].line))
         groups: dict[tuple[str, str, str], list[Element]] = {}
         for element, why in notes:
             groups.setdefault((str(element.file), element.kind, why), []).append(element)
         return [
-            NotTaken(elements[0].place, elements[0].path, why, len(elements))
+            Difference(elements[0].place, elements[0].path, why, len(elements))
             for (_, _, why), elements in groups.items()
         ]
 
@@ -159,8 +159,8 @@ class Element:
     """An XML element.
 
     Attributes:
-        text: what stands in it, without the white space around.
-        taken: whether it has been read; elements never read are listed as not taken over.
+        text: its text, without the white space around.
+        is_read: whether code has asked for it; unread elements are listed as unsupported.
     """
 
     tag: str
@@ -172,7 +172,7 @@ class Element:
     parent: Element | None = None
     text: str = ""
     children: list[Element] = field(default_factory=list)
-    taken: bool = False
+    is_read: bool = False
 
     @property
     def name(self) -> str:
@@ -184,13 +184,13 @@ class Element:
 
     @property
     def path(self) -> str:
-        """Its place in the document, as ``model[arm]/link[base]/inertial``."""
+        """Its path in the document, as ``model[arm]/link[base]/inertial``."""
         steps = [e.tag + (f"[{e.name}]" if e.name else "") for e in self.and_ancestors()][::-1]
         return "/".join(steps[1:] or steps)
 
     @property
     def kind(self) -> str:
-        """Its path without names."""
+        """The path without names."""
         tags = [element.tag for element in self.and_ancestors()][::-1]
         return "/".join(tags[1:] or tags)
 
@@ -200,7 +200,7 @@ class Element:
         return f"{display_name(self.file)}:{self.line}"
 
     def descendants(self) -> Iterator[Element]:
-        """This element and all in it, in the order of the document."""
+        """This element and all within, in the order of the document."""
         yield self
         for child in self.children:
             yield from child.descendants()
@@ -215,33 +215,33 @@ class Element:
         """A new element at the place of this one, without a parent."""
         return Element(tag, attributes, self.file, self.line, self.column, self.report)
 
-    # ---- children: what is asked for counts as read
+    # ---- children: asking for them marks them as read
 
     def child(self, *tags: str) -> Element | None:
-        """The first child with that tag (or at the end of a path of tags)."""
+        """The first child with that tag, or the element at the end of a path of tags."""
         element: Element | None = self
         for tag in tags:
             element = next((c for c in element.children if c.tag == tag), None) if element else None
             if element is not None:
-                element.taken = True
+                element.is_read = True
         return element
 
     def each(self, tag: str) -> list[Element]:
         """All children with that tag."""
         found = [child for child in self.children if child.tag == tag]
         for child in found:
-            child.taken = True
+            child.is_read = True
         return found
 
-    def take_all(self) -> None:
-        """Count it and everything in it as read."""
+    def mark_all_read(self) -> None:
+        """Mark this element and all within as read."""
         for element in self.descendants():
-            element.taken = True
+            element.is_read = True
 
-    # ---- values; after a problem the default holds
+    # ---- values; after a problem the default is returned
 
     def numbers(self, default: Sequence[float]) -> tuple[float, ...]:
-        """The numbers in it, as many as ``default`` has; they may be infinite."""
+        """The numbers in its text, as many as ``default`` has; they may be infinite."""
         count, values = len(default), list[float]()
         for word in self.text.split():
             try:
@@ -292,7 +292,7 @@ class Element:
         return word in ("true", "1")
 
     def has(self, attribute: str) -> bool:
-        """Whether a truth value among its attributes is true."""
+        """Whether an attribute is true."""
         return self.attributes.get(attribute) in ("true", "1")
 
     def text_of(self, tag: str) -> str:
@@ -303,27 +303,27 @@ class Element:
     # ---- report
 
     def problem(self, text: str, hint: str = "") -> None:
-        """Report what makes a conversion impossible."""
+        """Report a problem that makes the conversion impossible."""
         name = display_name(self.file)
         self.report.problems.append(Problem(name, self.line, self.column, self.path, text, hint))
 
-    def note(self, why: str) -> None:
-        """Report that it is not taken over, or otherwise; all in it counts as read."""
-        self.take_all()
+    def omit(self, why: str) -> None:
+        """Report that the element is left out; everything within counts as read."""
+        self.mark_all_read()
         self.report.notes.append((self, why))
 
     def remark(self, why: str) -> None:
-        """Note it, while its children are still to be read."""
-        self.taken = True
+        """Report a difference; the children are still to be read."""
+        self.is_read = True
         self.report.notes.append((self, why))
 
 
 class _Unwanted(Exception):
-    """XML that is well-formed, and not taken."""
+    """Well-formed XML that is refused."""
 
 
 class _Builder:
-    """Makes elements of what expat reports."""
+    """Makes elements from the events of expat."""
 
     def __init__(self, file: Path, report: Report) -> None:
         self.root: Element | None = None
@@ -358,15 +358,15 @@ class _Builder:
             self._texts[-1].append(text)
 
     def _refuse_entity(self, name: str, *_: object) -> None:
-        # Ten that name each other ten times are 10^9 characters.
+        # Ten entities that name each other ten times expand to 10^9 characters.
         raise _Unwanted(f"it declares the entity '{name}', which is not supported")
 
 
 def parse(file: Path, report: Report) -> Element | Problem:
-    """The root of an XML file, or why it cannot be read.
+    """The root of an XML file, or the problem with it.
 
     Raises:
-        DescriptionError: if ``report`` has counted too many elements.
+        DescriptionError: ``report`` has counted too many elements.
     """
     line, column = 1, 1
     report.count(file, _FILE_ELEMENTS)
@@ -380,7 +380,7 @@ def parse(file: Path, report: Report) -> Element | Problem:
     except expat.ExpatError as error:
         line, column = error.lineno, error.offset + 1
         text = f"this is not XML: {expat.ErrorString(error.code)}"
-    except (ValueError, LookupError) as error:  # LookupError: of its encoding
+    except (ValueError, LookupError) as error:  # LookupError: unknown encoding
         text = f"this is not XML: {error}"
     else:
         assert builder.root is not None, "expat reports an empty document itself"
@@ -389,7 +389,7 @@ def parse(file: Path, report: Report) -> Element | Problem:
 
 
 class NotFound(Exception):
-    """A URI that leads nowhere; the text says where was looked, the hint what to do."""
+    """A URI without a file; the text names the places searched, the hint what to do."""
 
     def __init__(self, text: str, hint: str = "") -> None:
         self.hint = hint
@@ -398,11 +398,11 @@ class NotFound(Exception):
 
 @dataclass(frozen=True)
 class Finder:
-    """Looks up URIs.
+    """Finds the files of URIs.
 
-    ``model://name/...`` and ``package://name/...`` are looked up in ``folders``, then in the
-    folders above the file that names them: there a model lies beside its neighbours. A package may
-    also lie in ``share`` of a ROS installation.
+    ``model://name/...`` and ``package://name/...`` are searched in ``folders``, then in the folders
+    above the file that names them, where neighbouring models lie. A package may also lie in
+    ``share`` of a ROS installation.
     """
 
     folders: Sequence[Path] = ()
@@ -427,7 +427,7 @@ class Finder:
         else:
             raise NotFound(f"'{uri}': there is no way to look up '{scheme}://'")
         for candidate in candidates:
-            if os.path.exists(candidate):  # which fails for no name, however long
+            if os.path.exists(candidate):  # unlike Path.exists, accepts names of any length
                 return candidate.resolve()
         hint = f"name its folder with -I, or in {' or '.join(PATH_VARIABLES[:2])}"
         raise NotFound(f"'{uri}' cannot be found", "" if scheme == "file" else hint)
@@ -443,14 +443,14 @@ class Finder:
         name, _, inside = rest.partition("/")
         for folder in (*self.folders, *([] if scheme == "model" else self.packages)):
             yield folder / name / inside
-            if folder.name == name:  # the folder of the model itself was named
+            if folder.name == name:  # the user has named the model's own folder
                 yield folder / inside
         for folder in (here, *here.parents):
             yield folder / name / inside
 
 
 def finder(folders: Sequence[Path], environ: Mapping[str, str]) -> Finder:
-    """The usual one: ``folders`` of the user's own first, then those in the environment."""
+    """A finder for ``folders`` of the user first, then those of the environment."""
     found = [folder.resolve() for folder in folders]
     for variable in PATH_VARIABLES:
         found += [Path(text) for text in environ.get(variable, "").split(os.pathsep) if text]

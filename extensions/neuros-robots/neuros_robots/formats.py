@@ -14,7 +14,7 @@ from neuros_robots.urdf import read_urdf
 
 
 class _Description(ModelFormat):
-    """A format of which the files of a model may lie in the folders of Gazebo's variables."""
+    """A format whose files may lie in the folders of Gazebo's variables."""
 
     def __init__(self, name: str, convert: Callable[[Path, Finder], Converted]) -> None:
         self.name = name
@@ -28,7 +28,7 @@ class _Description(ModelFormat):
 
     def read(self, file: Path, environ: Mapping[str, str]) -> tuple[Any, Sequence[str]]:
         converted = self._convert(file, finder((), environ))
-        return converted.spec, [str(note) for note in converted.not_taken]
+        return converted.spec, [str(note) for note in converted.differences]
 
 
 URDF = _Description("urdf", read_urdf)

@@ -1,13 +1,12 @@
-"""Poses, and the names and frames that place them in SDF: every model and world is a scope.
+"""Poses, named frames, and the tree of links in SDF; every model and world is a scope of names.
 
-A frame is a link, a joint, a nested model or a ``<frame>``; each is placed relative to another one
-of its scope, or of a scope within (``arm::hand``). A scope places them relative to its own frame,
-which is called ``__model__`` (in a world: ``world``). See http://sdformat.org, "Pose frame
-semantics".
+A frame is a link, a joint, a nested model or a ``<frame>``; its pose is relative to another frame
+of its scope, or of a scope within (``arm::hand``). The own frame of a scope is called ``__model__``
+(in a world: ``world``). See http://sdformat.org, "Pose frame semantics".
 
-Joints make a tree of the links (:func:`grow`). MuJoCo hangs every body on one other; SDF joins any
-two links. The tree begins with what hangs on the world, then with links that are no joint's child;
-a joint that it reaches from its child is turned round. Joints that close a loop are left over.
+SDF joins any two links; in MuJoCo each body has one parent. :func:`grow` makes the tree: it begins
+with the links that joints attach to the world, then with links that are no joint's child. A joint
+that is reached from its child is turned round. Joints that close a loop are left over.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _KINDS = ("link", "joint", "frame", "model")
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Position and rotation of one frame, seen from another.
+    """Position and rotation of a frame, seen from another.
 
     Attributes:
         position: of its origin, shape (3,), metres.
@@ -41,11 +40,11 @@ class Pose:
     rotation: Vector = field(default_factory=lambda: np.eye(3))
 
     def __matmul__(self, other: Pose) -> Pose:
-        """Chain two poses: ``other`` is seen from this one's frame."""
+        """Chain two poses; ``other`` is seen from this pose's frame."""
         return Pose(self.rotation @ other.position + self.position, self.rotation @ other.rotation)
 
     def inverse(self) -> Pose:
-        """The pose in the opposite direction: of the other frame, seen from this one."""
+        """The pose of the other frame, seen from this one."""
         return Pose(-self.rotation.T @ self.position, self.rotation.T)
 
     @property
@@ -57,7 +56,7 @@ class Pose:
 
 
 def from_rpy(x: float, y: float, z: float, roll: float, pitch: float, yaw: float) -> Pose:
-    """A pose in metres and radians; turned about the fixed axes x, y and z, in this order."""
+    """A pose in metres and radians, turned about the fixed axes x, y and z, in this order."""
     (sr, cr), (sp, cp), (sy, cy) = ((math.sin(a), math.cos(a)) for a in (roll, pitch, yaw))
     about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
     about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
@@ -66,7 +65,7 @@ def from_rpy(x: float, y: float, z: float, roll: float, pitch: float, yaw: float
 
 
 def from_quaternion(position: Sequence[float], wxyz: Sequence[float] | Vector) -> Pose:
-    """A pose in metres; the quaternion (w, x, y, z) need not have the length 1."""
+    """A pose in metres; the quaternion (w, x, y, z) may have any length but 0."""
     matrix, quaternion = np.zeros(9), np.array(wxyz, float)
     mujoco.mju_normalize4(quaternion)
     mujoco.mju_quat2Mat(matrix, quaternion)
@@ -74,7 +73,7 @@ def from_quaternion(position: Sequence[float], wxyz: Sequence[float] | Vector) -
 
 
 def read_pose(owner: Element) -> Pose:
-    """The pose in the ``<pose>`` of ``owner``, relative to what that names."""
+    """The pose in the ``<pose>`` of ``owner``, relative to the frame that it names."""
     element = owner.child("pose")
     if element is None or not element.text:
         return Pose()
@@ -92,7 +91,7 @@ def read_pose(owner: Element) -> Pose:
 
 @dataclass(eq=False)
 class Frame:
-    """A named place; ``base`` is the name of what it is placed relative to in its scope."""
+    """A named frame; ``raw`` is its pose relative to the frame ``base`` of its scope."""
 
     element: Element
     base: str
@@ -104,7 +103,7 @@ class Link:
     """A rigid body.
 
     Attributes:
-        name: as MuJoCo is to call it: the names of the models around it, and its own, by slashes.
+        name: the name in MuJoCo: the names of the models around it, and its own, by slashes.
         pose: in the world.
     """
 
@@ -120,7 +119,7 @@ class Scope:
     """A model, or a world.
 
     Attributes:
-        prefix: what the names of its elements begin with in MuJoCo: empty, or ``arm/hand/``.
+        prefix: of the names of its elements in MuJoCo: empty, or ``arm/hand/``.
         pose: in the world.
         models: the models in it, by name.
     """
@@ -142,7 +141,7 @@ class Scope:
 
     @property
     def outermost(self) -> Scope:
-        """The model that it belongs to and that belongs to no other one."""
+        """The model around it that is in no other model."""
         return self if self.parent is None or self.parent.is_world else self.parent.outermost
 
     def and_models(self) -> Iterator[Scope]:
@@ -157,7 +156,7 @@ class Scope:
             yield from ((scope, element) for element in scope.element.each(tag))
 
     def place(self, name: str, asking: Element) -> Pose:
-        """The pose of a frame in this scope's own frame; problems are reported of ``asking``."""
+        """The pose of a frame in this scope's own frame; problems are reported at ``asking``."""
         head, _, rest = name.partition("::")
         if rest:
             if head in self.models:
@@ -169,7 +168,13 @@ class Scope:
         if head not in self.frames:
             self._unknown(name, asking)
             return Pose()
-        for each in self._bases(head):
+        # From the farthest base on; not by recursion, which long chains would exhaust.
+        bases: dict[str, None] = {}
+        base = head
+        while base in self.frames and base not in self._places and base not in bases:
+            bases[base] = None
+            base = self.frames[base].base.partition("::")[0]
+        for each in reversed(bases):
             if each not in self._places:
                 self._places[each] = None
                 self._places[each] = self._placed(each)
@@ -178,14 +183,6 @@ class Scope:
             asking.problem(f"'{name}' is placed relative to itself")
             return Pose()
         return place
-
-    def _bases(self, name: str) -> Sequence[str]:
-        """The frames still to be placed for the one of that name, one after another."""
-        found: dict[str, None] = {}
-        while name in self.frames and name not in self._places and name not in found:
-            found[name] = None
-            name = self.frames[name].base.partition("::")[0]
-        return [*found][::-1]
 
     def _placed(self, name: str) -> Pose:
         frame = self.frames[name]
@@ -197,9 +194,9 @@ class Scope:
         return place
 
     def read_pose(self, owner: Element, default: Pose) -> Pose:
-        """The pose of something without a name (a collision, a sensor), in the world.
+        """The pose in the world of an element without a name (a collision, a sensor).
 
-        It is relative to ``default`` (in the world) unless it says otherwise.
+        It is relative to ``default``, a pose in the world, unless it names another frame.
         """
         base = relative_to(owner)
         if base:
@@ -224,7 +221,13 @@ class Scope:
             elif name in scope.links:
                 return scope.links[name]
             elif name in scope.frames:
-                scope, name = scope._attachment(name)
+                element = scope.frames[name].element
+                if element.tag == "model":
+                    scope, name = scope.models[name], "__model__"
+                elif element.tag == "joint":
+                    name = element.text_of("child")
+                else:
+                    name = element.attributes.get("attached_to") or "__model__"
             else:
                 scope._unknown(name, asking)
                 return None
@@ -232,7 +235,7 @@ class Scope:
         return None
 
     def canonical(self) -> str:
-        """The name of the link that stands for the model: the one it names, or the first."""
+        """The name of the link that represents the model: the one it names, or the first."""
         named = self.element.attributes.get("canonical_link")
         if named:
             return named
@@ -240,14 +243,6 @@ class Scope:
             return next(iter(self.links))
         inner = (f"{name}::__model__" for name, model in self.models.items() if model.canonical())
         return next(inner, "")
-
-    def _attachment(self, name: str) -> tuple[Scope, str]:
-        element = self.frames[name].element
-        if element.tag == "model":
-            return self.models[name], "__model__"
-        if element.tag == "joint":
-            return self, element.text_of("child")
-        return self, element.attributes.get("attached_to") or "__model__"
 
     def _unknown(self, name: str, asking: Element) -> None:
         names = ", ".join(sorted(self.frames)[:8])
@@ -265,7 +260,7 @@ def relative_to(owner: Element) -> str:
 
 
 def read_scope(element: Element, parent: Scope | None = None, prefix: str = "") -> Scope:
-    """A world or model with all that is in it, poses in the world still unknown."""
+    """A world or model with all its contents; poses in the world are not set yet."""
     scope = Scope(element, parent, prefix)
     placement = element.child("placement_frame")
     if placement is not None:
@@ -290,7 +285,7 @@ def place_all(scope: Scope) -> None:
         model.pose = scope.pose @ scope.place(name, model.element)
         place_all(model)
     for name in scope.frames:
-        scope.place(name, scope.frames[name].element)  # also those that nothing is relative to
+        scope.place(name, scope.frames[name].element)  # reports problems of unused frames, too
     for name, link in scope.links.items():
         link.pose = scope.pose @ scope.place(name, link.element)
 
@@ -340,7 +335,7 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """A link and what it hangs on: a joint to ``parent`` (``None``: the world), or nothing."""
+    """A link and its joint to ``parent`` (``None``: the world), or without a joint."""
 
     link: Link
     parent: Link | None = None
@@ -349,7 +344,7 @@ class Branch:
 
 
 def grow(links: Sequence[Link], joints: Sequence[Joint]) -> tuple[list[Branch], list[Joint]]:
-    """The tree of all links, parents before what hangs on them, and the joints that close loops.
+    """The tree of all links, parents first, and the joints that close loops.
 
     Links of static models hang on the world, without a joint.
     """
@@ -389,5 +384,5 @@ def grow(links: Sequence[Link], joints: Sequence[Joint]) -> tuple[list[Branch], 
 
 
 def _key(link: Link | None) -> int | None:
-    """The key of a link; one that never moves counts as the world."""
+    """The key of a link; static links and the world share one."""
     return None if link is None or link.is_static else id(link)

@@ -1,7 +1,7 @@
 """Parts of SDF links in MuJoCo: geoms of collisions and visuals, sensors, sites and lights.
 
-A sensor becomes a site or camera called ``link/sensor``: a node file names that as the ``element``
-of a sensor. MuJoCo's cameras show colours only; a lidar is a rangefinder per ray.
+A sensor becomes a site or camera called ``link/sensor``, which a node file names as the ``element``
+of a sensor. MuJoCo's cameras show colours only; a lidar is one rangefinder per ray.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from neuros_robots.mjcf import Building
 
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _GEOMS = mujoco.mjtGeom
-_ALL_MASKS = 0xFFFF  # what Gazebo gives a collision that names none
+_ALL_MASKS = 0xFFFF  # Gazebo's mask of a collision without one
 _GREY = (0.7, 0.7, 0.7, 1.0)
-# The diffuse colours of Gazebo's own materials, as far as a colour is all that they are.
+# The diffuse colours of those materials of Gazebo that are plain colours.
 _SCRIPTS: Mapping[str, tuple[float, float, float]] = {
     "Gazebo/Black": (0, 0, 0),
     "Gazebo/Blue": (0, 0, 1),
@@ -63,7 +63,7 @@ _CAMERAS = {
 _TO_RAY = Pose(rotation=np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]))
 _MOST_RAYS = 1000
 _MOST_PIXELS = 1 << 16
-_SAMPLES = {"horizontal": 640.0, "vertical": 1.0}  # where nothing says how many
+_SAMPLES = {"horizontal": 640.0, "vertical": 1.0}  # default numbers of rays
 _SITE = mujoco.mjtObj.mjOBJ_SITE
 _LIGHTS = {
     "directional": mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
@@ -74,7 +74,7 @@ _LIGHTS = {
 
 @dataclass
 class _Shape:
-    """A geometry as MuJoCo takes it: half lengths in metres; ``pose`` is seen from its owner."""
+    """A geometry in MuJoCo's terms: half lengths in metres; ``pose`` is seen from its owner."""
 
     type: Any
     size: list[float] = field(default_factory=list)
@@ -96,11 +96,14 @@ def add_shapes(building: Building, link: Link, *, is_solid: bool) -> None:
         geom = _add(building, link, element, is_solid=False)
         if geom is not None:
             geom.group, geom.contype, geom.conaffinity, geom.mass = _VISUAL_GROUP, 0, 0, 0
-            geom.rgba = _colour(element)
+            opacity = 1.0 - element.number("transparency", 0.0)
+            material = element.child("material")
+            red, green, blue, alpha = _GREY if material is None else _diffuse(material)
+            geom.rgba = (red, green, blue, alpha * opacity)
 
 
 def share_masks(building: Building) -> None:
-    """Give the geoms without a mask Gazebo's, once any geom has one of its own."""
+    """Give geoms without a mask Gazebo's mask, if any geom has one of its own."""
     if building.masks:
         for key, geom in building.geoms.items():
             geom.contype = geom.conaffinity = building.masks.get(key, _ALL_MASKS)
@@ -111,11 +114,11 @@ def _add(building: Building, link: Link, element: Element, *, is_solid: bool) ->
     if shape is None:
         return None
     if shape.type == _GEOMS.mjGEOM_PLANE and not link.is_static:
-        element.note("MuJoCo has planes only where nothing moves")
+        element.omit("MuJoCo has planes only where nothing moves")
         return None
     pose = link.scope.read_pose(element, link.pose) @ shape.pose
     name = f"{link.name}/{element.name}"
-    noting = element if element.tag == "collision" else None  # visuals are not looked up by name
+    noting = element if element.tag == "collision" else None  # node files do not name visuals
     geom = building.add("geom", link, pose, name, noting, type=shape.type)
     geom.size[: len(shape.size)] = shape.size
     if shape.mesh:
@@ -134,7 +137,7 @@ def _read(building: Building, owner: Element, *, is_solid: bool) -> _Shape | Non
     element = next(iter(geometry.children), None)
     if element is None:
         return None
-    element.taken = True
+    element.is_read = True
 
     def positive(tag: str, default: float) -> float:
         return element.number(tag, default, positive=True)
@@ -153,10 +156,24 @@ def _read(building: Building, owner: Element, *, is_solid: bool) -> _Shape | Non
             radii = element.vector("radii", (1.0, 1.0, 1.0))
             return _Shape(_GEOMS.mjGEOM_ELLIPSOID, _all_positive(element, radii))
         case "plane":
-            return _plane(element)
+            normal = np.array(element.vector("normal", (0.0, 0.0, 1.0)))
+            if not normal.any():
+                element.problem("the normal is zero")
+                return None
+            quaternion = np.zeros(4)
+            mujoco.mju_quatZ2Vec(quaternion, normal / np.linalg.norm(normal))
+            turned = from_quaternion((0, 0, 0), quaternion)
+            return _Shape(_GEOMS.mjGEOM_PLANE, [*_halves(element, (1, 1)), 1.0], pose=turned)
         case "mesh":
-            return _mesh(building, owner, element, is_solid=is_solid)
-    element.note(f"MuJoCo has no geom for a <{element.tag}>")
+            uri = element.child("uri")
+            if uri is None or not uri.text:
+                element.problem("<uri> is missing: which file is the mesh in?")
+                return None
+            scale = element.vector("scale", (1.0, 1.0, 1.0))
+            is_needed = owner.tag == "collision"
+            name = building.meshes.add(uri, scale, is_solid=is_solid, is_needed=is_needed)
+            return None if name is None else _Shape(_GEOMS.mjGEOM_MESH, mesh=name)
+    element.omit(f"MuJoCo has no geom for a <{element.tag}>")
     return None
 
 
@@ -169,29 +186,6 @@ def _all_positive(element: Element, sizes: tuple[float, ...]) -> list[float]:
         return list(sizes)
     element.problem("every size must be positive")
     return [1.0] * len(sizes)
-
-
-def _plane(element: Element) -> _Shape | None:
-    normal = np.array(element.vector("normal", (0.0, 0.0, 1.0)))
-    if not normal.any():
-        element.problem("the normal is zero")
-        return None
-    size = _halves(element, (1, 1))
-    quaternion = np.zeros(4)
-    mujoco.mju_quatZ2Vec(quaternion, normal / np.linalg.norm(normal))
-    turned = from_quaternion((0, 0, 0), quaternion)
-    return _Shape(_GEOMS.mjGEOM_PLANE, [*size, 1.0], pose=turned)
-
-
-def _mesh(building: Building, owner: Element, element: Element, *, is_solid: bool) -> _Shape | None:
-    uri = element.child("uri")
-    if uri is None or not uri.text:
-        element.problem("<uri> is missing: which file is the mesh in?")
-        return None
-    scale = element.vector("scale", (1.0, 1.0, 1.0))
-    is_needed = owner.tag == "collision"
-    name = building.meshes.add(uri, scale, is_solid=is_solid, is_needed=is_needed)
-    return None if name is None else _Shape(_GEOMS.mjGEOM_MESH, mesh=name)
 
 
 def _read_surface(building: Building, collision: Element, geom: Any) -> None:
@@ -218,24 +212,17 @@ def _read_surface(building: Building, collision: Element, geom: Any) -> None:
             mask.problem(f"'{mask.text}' is not a whole number")
 
 
-def _colour(visual: Element) -> tuple[float, ...]:
-    """Red, green, blue and opacity of a visual, each from 0 to 1."""
-    opacity = 1.0 - visual.number("transparency", 0.0)
-    material = visual.child("material")
-    red, green, blue, alpha = _GREY if material is None else _diffuse(material)
-    return (red, green, blue, alpha * opacity)
-
-
 def _diffuse(material: Element) -> tuple[float, ...]:
+    """Red, green, blue and opacity of a material, each from 0 to 1."""
     base = _GREY
     script = material.child("script")
     if script is not None:
         name = script.text_of("name")
         if name in _SCRIPTS:
-            script.take_all()
+            script.mark_all_read()
             base = (*_SCRIPTS[name], 1.0)
         else:
-            script.note("a material script of Gazebo's")
+            script.omit("a material script of Gazebo's")
     element = material.child("diffuse")
     if element is None:
         return base
@@ -262,23 +249,23 @@ def add_link_sensors(building: Building, link: Link) -> None:
             _add_rays(building, link, element, pose)
         elif kind == "contact":
             how = '`"sensor": "contacts"`, `"element": "link/collision"`'
-            element.note(f"declare it in the node file: {how}")
+            element.omit(f"declare it in the node file: {how}")
         elif kind in _SIMPLE:
             site = _add_site(building, link, element, pose)
             for what, sort in _SIMPLE[kind]:
                 _add_sensor(building, f"{site}/{what}", sort, site, element)
             if kind == "altimeter":
                 element.remark("the whole position and velocity in MuJoCo")
-            element.child(kind)  # now read; what is inside it is listed
+            element.child(kind)  # marks it as read; its content is listed
         else:
-            element.note(f"MuJoCo has no sensor like '{kind}'")
+            element.omit(f"MuJoCo has no sensor like '{kind}'")
 
 
 def add_joint_sensors(building: Building, link: Link, joint: Joint, *, is_turned: bool) -> None:
-    """Add the sensors of the joint that the body of a link hangs on."""
+    """Add the sensors of a joint to the body of its link."""
     for element in joint.element.each("sensor"):
         if element.type != "force_torque":
-            element.note("only a force_torque sensor belongs to a joint")
+            element.omit("only a force_torque sensor belongs to a joint")
             continue
         settings = element.child("force_torque") or element.made("force_torque")
         frame = settings.text_of("frame") or "child"
@@ -289,8 +276,8 @@ def add_joint_sensors(building: Building, link: Link, joint: Joint, *, is_turned
             place = Pose(place.position, np.eye(3) if end is None else end.pose.rotation)
         elif frame != "sensor":
             settings.problem(f"'{frame}' is not child, parent or sensor")
-        # MuJoCo measures the force on the body that hangs; SDF, unless told otherwise, what the
-        # child does to the parent.
+        # MuJoCo measures the force on the child body; SDF, by default, that of the child on the
+        # parent.
         if (settings.text_of("measure_direction") == "parent_to_child") == is_turned:
             element.remark("with the opposite sign in MuJoCo")
         site = _add_site(building, link, element, place, f"{joint.name}/{element.name}")
@@ -309,24 +296,19 @@ def _add_imu(building: Building, link: Link, element: Element, pose: Pose) -> No
         sensor = _add_sensor(building, f"{site}/{what}", sort, site, element)
         axes = imu.child(group) if imu is not None and group else None
         if axes is not None:
-            sensor.noise = _deviation(axes)
-
-
-def _deviation(axes: Element) -> float:
-    """The largest standard deviation of three axes; MuJoCo keeps one number, and adds no noise."""
-    largest = 0.0
-    for axis in axes.children:
-        noise = axis.child("noise")
-        if noise is not None and noise.attributes.get("type", "none") != "none":
-            largest = max(largest, noise.number("stddev", 0.0))
-            noise.note("the deviation becomes the covariance; no noise is added")
-        axis.take_all()
-    axes.taken = True
-    return largest
+            # The largest standard deviation of the axes: MuJoCo keeps one number.
+            sensor.noise = 0.0
+            for axis in axes.children:
+                noise = axis.child("noise")
+                if noise is not None and noise.attributes.get("type", "none") != "none":
+                    sensor.noise = max(sensor.noise, noise.number("stddev", 0.0))
+                    noise.omit("the deviation becomes the covariance; no noise is added")
+                axis.mark_all_read()
+            axes.is_read = True
 
 
 def _add_camera(building: Building, link: Link, element: Element, pose: Pose) -> None:
-    """Add the camera of a sensor, whose own pose in the world is ``pose``."""
+    """Add the camera of a sensor with the pose ``pose`` in the world."""
     settings = element.child("camera") or element.made("camera")
     image = settings.child("image") or element.made("image")
     pose = link.scope.read_pose(settings, pose)
@@ -354,12 +336,12 @@ def _add_rays(building: Building, link: Link, element: Element, pose: Pose) -> N
     )
     count = columns * rows
     if not 1 <= count <= _MOST_RAYS:
-        element.note(f"{count} rays: MuJoCo has a sensor for each, and {_MOST_RAYS} at most")
+        element.omit(f"{count} rays: MuJoCo has a sensor for each, and {_MOST_RAYS} at most")
         return
     distance = settings.child("range")
     most = math.inf if distance is None else distance.number("max", math.inf)
     if distance is not None:
-        distance.take_all()
+        distance.mark_all_read()
     for row, pitch in enumerate(pitches):
         for column, yaw in enumerate(yaws):
             ray = pose @ from_rpy(0, 0, 0, 0, -pitch, yaw) @ _TO_RAY
@@ -386,7 +368,7 @@ def _angles(settings: Element, way: str) -> tuple[int, list[float]]:
 
 
 def add_frames(building: Building, scope: Scope) -> None:
-    """A site for every ``<frame>``: a place with a name, as the tip of a tool."""
+    """Add a site for every ``<frame>``."""
     for inner, element in scope.each("frame"):
         if inner.is_world or element.name not in inner.frames or element.name[:1] == "_":
             continue
@@ -399,7 +381,7 @@ def add_frames(building: Building, scope: Scope) -> None:
 def _add_site(
     building: Building, link: Link, element: Element, pose: Pose, wanted: str = ""
 ) -> str:
-    """Add a site to a link, where ``pose`` is in the world; returns its name."""
+    """Add a site to a link, with its pose in the world; returns its name."""
     name = wanted or f"{link.name}/{element.name}"
     return str(building.add("site", link, pose, name, element, group=4).name)
 
@@ -411,7 +393,7 @@ def _add_sensor(building: Building, name: str, kind: Any, site: str, element: El
 
 
 def add_lights(building: Building, scope: Scope) -> None:
-    """Lights of a world, of models and of links."""
+    """Add the lights of a world, of models and of links."""
     for inner in scope.and_models():
         for link in (None, *inner.links.values()):
             owner = inner if link is None else link

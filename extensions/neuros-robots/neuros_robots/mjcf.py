@@ -1,8 +1,7 @@
-"""Model under construction, its meshes, and the result as an MJCF file.
+"""A model under construction, its meshes, and the result as an MJCF file.
 
-Meshes are files that MuJoCo reads, converted ones, and flat ones. MuJoCo collides the convex hull
-of a mesh, and a flat mesh (a floor of two triangles, say) has none: a thin box collides in its
-place.
+MuJoCo reads some meshes itself, others are converted. MuJoCo collides the convex hull of a mesh; a
+flat mesh (a floor of two triangles, say) has none, so a thin box replaces it.
 """
 
 from __future__ import annotations
@@ -19,11 +18,11 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
-from neuros_robots.elements import Element, Finder, NotFound, NotTaken
+from neuros_robots.elements import Difference, Element, Finder, NotFound
 from neuros_robots.frames import Link, Pose, Vector, from_quaternion
 
 MARK = "made by `neuros convert`"
-"""Stands in the first line of every file that is written here, and may be overwritten."""
+"""Stands in the first line of every file written here; such files may be overwritten."""
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 _CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
 _CONVERTERS = ("trimesh", "collada")
@@ -31,9 +30,9 @@ _SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 _HOW = "`pip install 'neuros[meshes]'` converts it"
 Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
 """Vertices, shape (n, 3), metres, and the numbers of the corners of faces, shape (m, 3)."""
-_FLAT = 1e-4  # how thick, at most, by how long
+_FLAT = 1e-4  # largest ratio of thickness to length of a flat mesh
 _THICKNESS_M = 0.01
-_RECTANGULAR = 0.999  # of its area, at least
+_RECTANGULAR = 0.999  # smallest share of a rectangle that a rectangular mesh fills
 
 
 @dataclass
@@ -45,8 +44,8 @@ class Building:
         bodies: its bodies by the id of their links.
         geoms: the geoms made from collisions, by the id of their elements.
         colliding_meshes: the <mesh> of collisions, by the names of their geoms.
-        masks: what collisions say that they collide with, by the id of their elements.
-        joints: the names of the joints made from a joint, by its name.
+        masks: the collision masks of collisions, by the id of their elements.
+        joints: the names of MuJoCo's joints for a joint, by its name.
     """
 
     spec: Any
@@ -59,7 +58,7 @@ class Building:
     _names: dict[tuple[str, str], int] = field(default_factory=lambda: {("body", "world"): 1})
 
     def body(self, link: Link | None) -> Any:
-        """The body of a link; the world without one."""
+        """The body of a link, or for ``None`` the world."""
         return self.spec.worldbody if link is None else self.bodies[id(link)]
 
     def add(
@@ -73,8 +72,7 @@ class Building:
     ) -> Any:
         """Add a geom, site, camera, light or body, whose ``pose`` is in the world, to a link.
 
-        Args:
-            element: is told if its name is changed.
+        A change of its name is reported at ``element``.
         """
         thing = getattr(self.body(link), f"add_{sort}")(**attributes)
         thing.name = self.name(sort, name, element)
@@ -85,7 +83,7 @@ class Building:
         return thing
 
     def name(self, sort: str, wanted: str, element: Element | None) -> str:
-        """A name that no other element of its sort (geom, site, ...) has; a change is noted."""
+        """A name that is unique in its sort (geom, site, ...); a change is reported."""
         name, number = wanted, self._names.get((sort, wanted), 0) + 1
         while number > 1 and (sort, name := f"{wanted}_{number}") in self._names:
             number += 1
@@ -98,29 +96,29 @@ class Building:
 
 @dataclass(frozen=True)
 class Converted:
-    """A description as MuJoCo has it.
+    """A converted description.
 
     Attributes:
         spec: the ``MjSpec``; its meshes have absolute paths.
-        not_taken: what of the description it does not have.
-        made_meshes: triangles of those meshes that MuJoCo cannot read itself, by their names.
-        bodies, joints: how many there are.
+        differences: parts of the description that it lacks, or has in another form.
+        made_meshes: triangles of the converted meshes, by their names.
+        bodies, joints: their numbers.
     """
 
     spec: Any
-    not_taken: Sequence[NotTaken]
+    differences: Sequence[Difference]
     made_meshes: dict[str, Triangles]
     bodies: int
     joints: int
 
 
 def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
-    """Write MJCF, what was not taken over as a comment in it; returns all files written.
+    """Write MJCF with the differences in a comment; returns all written files.
 
-    Meshes are named relative to the file. It is compiled once more from the disk before it takes
-    its name, so that a file that is there works.
+    Meshes are named relative to the file. A draft is compiled from the disk before it gets its
+    name, so that an existing file works.
 
-    Raises ``OSError``, and ``ValueError`` if MuJoCo does not read what it wrote.
+    Raises ``OSError``, and ``ValueError`` if MuJoCo cannot read the draft.
     """
     spec = converted.spec.copy()
     spec.modelfiledir = str(output.resolve().parent)
@@ -131,15 +129,24 @@ def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
         if mesh.name in converted.made_meshes:
             name = re.sub(r"[^\w.-]", "_", mesh.name)
             file = folder / f"{output.stem}_meshes" / f"{name}.obj"
-            while file in written:  # names that differ in what no file name has
+            while file in written:  # different names may become the same file name
                 file = file.with_stem(f"{file.stem}_")
-            _write_obj(file, converted.made_meshes[mesh.name])
+            vertices, faces = converted.made_meshes[mesh.name]
+            file.parent.mkdir(parents=True, exist_ok=True)
+            rows = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+            rows += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+            file.write_text("\n".join(rows) + "\n", "ascii")
             written.append(file)
             mesh.uservert, mesh.userface, mesh.file = [], [], str(file)
         mesh.file = os.path.relpath(mesh.file, folder)
+    lines = [f"{MARK} from {source.name}"]
+    if converted.differences:
+        lines += ["", "Not taken over, or not as it was:"]
+        lines += [f"  {note}" for note in converted.differences]
+    comment = "\n".join(lines).replace("--", "- -")
     draft = folder / f".{output.stem}.draft.xml"
     try:
-        draft.write_text(_comment(converted, source) + spec.to_xml(), "utf-8")
+        draft.write_text(f"<!-- {comment}\n-->\n{spec.to_xml()}", "utf-8")
         mujoco.MjSpec.from_file(str(draft)).compile()
         draft.replace(output)
     finally:
@@ -148,26 +155,9 @@ def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
 
 
 def is_ours(file: Path) -> bool:
-    """Whether a file was written here."""
+    """Whether a file was written by :func:`write_mjcf`."""
     with file.open(encoding="utf-8", errors="replace") as text:
         return MARK in text.readline()
-
-
-def _comment(converted: Converted, source: Path) -> str:
-    lines = [f"{MARK} from {source.name}"]
-    if converted.not_taken:
-        lines += ["", "Not taken over, or not as it was:"]
-        lines += [f"  {note}" for note in converted.not_taken]
-    text = "\n".join(lines).replace("--", "- -")
-    return f"<!-- {text}\n-->\n"
-
-
-def _write_obj(file: Path, triangles: Triangles) -> None:
-    vertices, faces = triangles
-    file.parent.mkdir(parents=True, exist_ok=True)
-    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
-    file.write_text("\n".join(lines) + "\n", "ascii")
 
 
 @dataclass
@@ -175,7 +165,7 @@ class Meshes:
     """The mesh assets of a model: each file and scale once.
 
     Attributes:
-        made: those that MuJoCo cannot read itself, by the names of their assets.
+        made: the converted ones, by the names of their assets.
     """
 
     spec: Any
@@ -190,7 +180,7 @@ class Meshes:
         """The name of the asset for the file that ``uri`` names.
 
         ``None`` if there is none: a missing file is a problem where it ``is_needed``, else a note.
-        A solid one has a volume, from which MuJoCo computes its mass.
+        MuJoCo computes the mass of a solid mesh from its volume.
         """
         try:
             file = self.finder.find_file(uri.text, uri.file.parent)
@@ -198,22 +188,22 @@ class Meshes:
             if is_needed:
                 uri.problem(str(error), error.hint)
             else:
-                uri.note(f"{error} ({error.hint})" if error.hint else str(error))
+                uri.omit(f"{error} ({error.hint})" if error.hint else str(error))
             return None
         key = (file, scale, is_solid)
         if key not in self._names:
             self._names[key] = self._new(uri, file, scale, is_solid)
         elif self._names[key] is None:
-            uri.note(why_unread(file))
+            uri.omit(why_unread(file))
         return self._names[key]
 
-    def blame(self) -> None:
-        """Report the meshes that MuJoCo cannot use, once a model with them does not compile."""
+    def report_unusable(self) -> None:
+        """Report the unusable meshes of a model that does not compile."""
         for mesh in self.spec.meshes:
             try:
                 _compile_alone(mesh, self.made.get(mesh.name))
             except ValueError as error:
-                self._places[mesh.name].problem(f"MuJoCo cannot use the mesh: {said_by(error)}")
+                self._places[mesh.name].problem(f"MuJoCo cannot use the mesh: {message_of(error)}")
 
     def _new(
         self, uri: Element, file: Path, scale: tuple[float, ...], is_solid: bool
@@ -222,7 +212,7 @@ class Meshes:
         if needs_conversion(file):
             triangles = triangles_of(file)
             if triangles is None:
-                uri.note(why_unread(file))
+                uri.omit(why_unread(file))
                 return None
         name, number = file.stem, 1
         while name in self._places:
@@ -240,15 +230,15 @@ class Meshes:
         return name
 
 
-def said_by(error: Exception) -> str:
-    """What MuJoCo says of a model that it cannot compile, in one line."""
+def message_of(error: Exception) -> str:
+    """The message of an error of MuJoCo's compiler, in one line."""
     return " ".join(str(error).removeprefix("Error: ").split())
 
 
 def _compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: bool = False) -> Any:
     """The ``MjModel`` of one mesh, which collides unless it ``is_shown_only``.
 
-    ``triangles`` are its own, if it has no file. Raises ``ValueError``.
+    ``triangles`` are those of a mesh without a file. Raises ``ValueError``.
     """
     trial = mujoco.MjSpec()
     alone = trial.add_mesh(name=mesh.name, file=mesh.file, scale=mesh.scale)
@@ -262,7 +252,7 @@ def _compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: boo
 
 
 def why_unread(file: Path) -> str:
-    """Why a file that needs conversion has no triangles here, and what to do."""
+    """Why a file that needs conversion has no triangles, and what to do."""
     kind = "STL in text form" if _is_text_stl(file) else f"{file.suffix or 'such'} files"
     if file.suffix.lower() not in (*_CONVERTED, ".stl"):
         return f"MuJoCo does not read {kind}: convert it to OBJ"
@@ -283,7 +273,7 @@ def fill(mesh: Any, triangles: Triangles) -> None:
 
 
 def _is_text_stl(file: Path) -> bool:
-    """Whether an STL file is one in text form, by its size: a binary one says how long it is."""
+    """Whether a file is STL in text form: the size of a binary one follows from its header."""
     if file.suffix.lower() != ".stl":
         return False
     with file.open("rb") as stl:
@@ -293,17 +283,14 @@ def _is_text_stl(file: Path) -> bool:
 
 
 def triangles_of(file: Path) -> Triangles | None:
-    """The triangles of a file of another kind in metres; ``None`` if nothing here reads it.
-
-    The axes stay unchanged, as in Gazebo, whichever of them the file calls up.
-    """
+    """The triangles of a file in metres, axes unchanged as in Gazebo; ``None`` if unreadable."""
     try:
         import trimesh
 
         scene = trimesh.load_scene(str(file))
         mesh = scene.to_geometry()
         unit = float(trimesh.units.unit_conversion(mesh.units or "meters", "meters"))
-    except Exception:  # readers of other people's make raise anything for a damaged file
+    except Exception:  # readers of third parties raise anything for a damaged file
         return None
     if not len(getattr(mesh, "faces", ())):
         return None
@@ -325,37 +312,27 @@ class Slab:
 
 
 def compile_boxed(
-    spec: Any, made: dict[str, Triangles], heard: list[Any]
+    spec: Any, made: dict[str, Triangles], caught: list[Any]
 ) -> tuple[Any, list[tuple[Any, Slab]]]:
-    """Compile a copy of a spec that was never compiled, with boxes for flat meshes that collide.
+    """Compile a copy of an uncompiled spec, with boxes for flat meshes that collide.
 
     Args:
-        made: triangles of meshes that have no file.
-        heard: warnings; those of a first try are dropped.
+        made: triangles of meshes without a file.
+        caught: warnings; those of the first attempt are dropped.
 
     Returns:
-        The ``MjModel``, and the geoms that became boxes. Raises what MuJoCo does.
+        The ``MjModel``, and the geoms that became boxes. Raises MuJoCo's errors.
     """
     try:
-        model = spec.copy().compile()  # MuJoCo 3 forgets no mesh of a geom
-        if not _has_flat_meshes(model):
+        model = spec.copy().compile()  # a copy: MuJoCo 3 keeps the meshes of compiled geoms
+        # A mesh that is flat but for rounding compiles, and holds nothing.
+        is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
+        sizes = model.geom_size[is_mesh & ((model.geom_contype | model.geom_conaffinity) != 0)]
+        if not np.any(sizes.min(axis=1) <= _FLAT * sizes.max(axis=1)):
             return model, []
     except ValueError:
-        pass  # perhaps for a flat mesh; if not, it is raised again below
-    heard.clear()
-    boxed = _box_flat_meshes(spec, made)
-    return spec.copy().compile(), boxed
-
-
-def _has_flat_meshes(model: Any) -> bool:
-    """Whether a mesh collides that is flat but for rounding: it compiles, and holds nothing."""
-    is_mesh = model.geom_type == mujoco.mjtGeom.mjGEOM_MESH.value
-    sizes = model.geom_size[is_mesh & ((model.geom_contype | model.geom_conaffinity) != 0)]
-    return bool(np.any(sizes.min(axis=1) <= _FLAT * sizes.max(axis=1)))
-
-
-def _box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, Slab]]:
-    """Turn colliding geoms of flat meshes into boxes; those that only show one stay unchanged."""
+        pass  # the cause may be a flat mesh; other errors are raised again below
+    caught.clear()
     boxed = []
     for mesh in list(spec.meshes):
         slab = _slab_of(mesh, made.get(mesh.name))
@@ -373,11 +350,14 @@ def _box_flat_meshes(spec: Any, made: dict[str, Triangles]) -> list[tuple[Any, S
         else:
             made.pop(mesh.name, None)
             spec.delete(mesh)
-    return boxed
+    return spec.copy().compile(), boxed
 
 
 def _slab_of(mesh: Any, triangles: Triangles | None) -> Slab | None:
-    """``None`` where a mesh is not flat, or is at fault in another way."""
+    """A flat mesh as a box; ``None`` for other meshes.
+
+    The box is behind the plane of the mesh, or around it where triangles show both sides.
+    """
     try:
         model = _compile_alone(mesh, triangles, is_shown_only=True)
     except ValueError:
@@ -386,11 +366,7 @@ def _slab_of(mesh: Any, triangles: Triangles | None) -> Slab | None:
     moved = from_quaternion(model.mesh_pos[0], model.mesh_quat[0])
     vertices = model.mesh_vert @ moved.rotation.T + moved.position
     corners = vertices[model.mesh_face]
-    return _fit(vertices, np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
-
-
-def _fit(vertices: Vector, normals: Vector) -> Slab | None:
-    """The slab behind the plane of ``vertices``, or around it where triangles show both sides."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     front, centre = normals.sum(axis=0), vertices.mean(axis=0)
     axes = np.linalg.svd(vertices - centre, full_matrices=False)[2]
     if axes[2] @ front < 0:
@@ -413,7 +389,7 @@ def _fit(vertices: Vector, normals: Vector) -> Slab | None:
 
 
 def _rectangle(points: Vector) -> tuple[Vector, Vector, Vector, float]:
-    """The smallest rectangle around points, shape (n, 2): axes, corners, and how full it is.
+    """The smallest rectangle around points, shape (n, 2): axes, corners, and filled share.
 
     One of its sides lies along an edge of the convex hull (Freeman and Shapira 1975).
     """
@@ -431,7 +407,7 @@ def _rectangle(points: Vector) -> tuple[Vector, Vector, Vector, float]:
 
 
 def _convex_hull(points: Vector) -> Vector:
-    """Its corners in their order, shape (n, 2) (Andrew's monotone chain)."""
+    """The corners of the hull in their order, shape (n, 2) (Andrew's monotone chain)."""
     ordered = sorted(set(map(tuple, points.tolist())))
     corners: list[tuple[float, float]] = []
     for way in (ordered, ordered[::-1]):

@@ -14,7 +14,7 @@ from neuros.errors import Problem
 from neuros_robots import bodies, links
 from neuros_robots.elements import DEEPEST, Element, Finder, NotFound, Report, parse
 from neuros_robots.frames import Branch, Joint, Link, Scope, grow, place_all, read_scope
-from neuros_robots.mjcf import Building, Converted, Meshes, compile_boxed, said_by
+from neuros_robots.mjcf import Building, Converted, Meshes, compile_boxed, message_of
 
 _OVERRIDDEN = ("pose", "static", "placement_frame")  # by the children of an <include>
 _MOST_LINKS = 1000
@@ -23,10 +23,10 @@ _MAGNETIC_FIELD_T = (5.5645e-6, 22.8758e-6, -42.3884e-6)
 
 
 def convert_sdf(file: Path, finder: Finder) -> Converted:
-    """Convert the world of an SDF file, or else its model; ``finder`` looks up what it names.
+    """Convert the world of an SDF file, or else its model; ``finder`` finds the files it names.
 
     Raises:
-        DescriptionError: with everything that is wrong with the file and those that it includes.
+        DescriptionError: with every problem of the file and of the files that it includes.
     """
     report = Report()
     includer = Includer(finder, report)
@@ -39,23 +39,38 @@ def convert_sdf(file: Path, finder: Finder) -> Converted:
     spec.compiler.degree = False
     spec.modelname = (scope.element.name or next(iter(scope.models), "")) or "sdf"
     building = Building(spec, Meshes(spec, finder))
-    _build(building, scope, *_grow(scope))
+    branches, loops = _grow(scope)
+    if scope.element.tag == "world":
+        _read_world(building, scope)
+    for branch in branches:
+        bodies.add_body(building, branch)
+    links.share_masks(building)
+    for branch in branches:
+        if branch.joint is not None:
+            links.add_joint_sensors(building, branch.link, branch.joint, is_turned=branch.is_turned)
+    for joint in loops:
+        bodies.close_loop(building, joint)
+    bodies.add_mimics(building, scope)
+    bodies.add_actuators(building, scope)
+    links.add_frames(building, scope)
+    links.add_lights(building, scope)
+    _exclude_contacts(building, scope)
     report.raise_any()
     model = _compiled(building, root)
-    report.note_unread(includer.roots)
+    report.omit_unread(includer.roots)
     made = building.meshes.made
-    return Converted(spec, report.not_taken(), made, model.nbody - 1, model.njnt)
+    return Converted(spec, report.differences(), made, model.nbody - 1, model.njnt)
 
 
 class Includer:
-    """Replaces the ``<include>`` elements of a document, and of what it includes, by models."""
+    """Replaces ``<include>`` elements of a document by the included models, recursively."""
 
     def __init__(self, finder: Finder, report: Report) -> None:
         self._finder, self._report = finder, report
         self.roots: list[Element] = []
 
     def read(self, file: Path, chain: Sequence[Path] = (), depth: int = 0) -> Element | None:
-        """The root of an SDF file with everything in it that it includes; problems are reported."""
+        """The root of an SDF file with all its included models; problems are reported."""
         root = parse(file, self._report)
         if isinstance(root, Problem):
             self._report.problems.append(root)
@@ -63,7 +78,7 @@ class Includer:
         if root.tag != "sdf":
             root.problem(f"an SDF file begins with <sdf>, not with <{root.tag}>")
             return None
-        root.taken = True
+        root.is_read = True
         self.roots.append(root)
         self._expand(root, (*chain, file), depth)
         return root
@@ -75,7 +90,7 @@ class Includer:
         expanded: list[Element] = []
         for child in owner.children:
             if child.tag == "include":
-                child.taken = True
+                child.is_read = True
                 expanded += self._included(child, owner, chain, depth)
             else:
                 if child.tag in ("world", "model"):
@@ -98,7 +113,7 @@ class Includer:
                 model.children = [*(c for c in model.children if c.tag != tag), own]
         for child in include.children:
             if child.tag == "plugin" or ":" in child.tag:
-                child.note("an addition to the included model for Gazebo")
+                child.omit("an addition to the included model for Gazebo")
         if include.has("merge"):
             return _merged(model, owner)
         model.parent = owner
@@ -130,7 +145,7 @@ class Includer:
 
 
 def model_file(path: Path) -> Path:
-    """The SDF file behind a URI: itself, or the newest that ``model.config`` of a folder names.
+    """The SDF file of a URI: the path, or the newest file that the folder's ``model.config`` names.
 
     Raises :class:`NotFound`.
     """
@@ -143,7 +158,14 @@ def model_file(path: Path) -> Path:
             raise NotFound(str(root))
         named = [element for element in root.each("sdf") if element.text]
         if named:
-            newest = max(named, key=lambda element: _version(element.attributes.get("version", "")))
+            # Each part of a version as a number, 0 where it is none.
+            newest = max(
+                named,
+                key=lambda element: [
+                    int(part) if part.isdecimal() else 0
+                    for part in element.attributes.get("version", "")[:20].split(".")
+                ],
+            )
             file = path / newest.text
             if not os.path.isfile(file):
                 raise NotFound(f"{newest.place} names '{newest.text}', which does not exist")
@@ -154,21 +176,17 @@ def model_file(path: Path) -> Path:
     raise NotFound(f"the folder '{path}' has neither a model.config nor a model.sdf")
 
 
-def _version(text: str) -> tuple[int, ...]:
-    return tuple(int(part) if part.isdecimal() else 0 for part in text[:20].split("."))
-
-
 def _merged(model: Element, owner: Element) -> list[Element]:
-    """The content of a model as if it stood in ``owner`` itself (``merge="true"``).
+    """The content of a model as part of ``owner`` (``merge="true"``).
 
-    A frame stands for the model's own: all that was relative to that is relative to it now.
+    A frame replaces the model's own frame: poses relative to the model become relative to it.
     """
     proxy = f"_merged__{model.name}__model__"
     frame = model.made("frame", name=proxy)
     frame.parent = owner
     placement = model.child("placement_frame")
     if placement is not None:
-        placement.note("not used in a merged include")
+        placement.omit("not used in a merged include")
     frame.children = model.each("pose")
     for pose in frame.children:
         pose.parent = frame
@@ -182,7 +200,7 @@ def _merged(model: Element, owner: Element) -> list[Element]:
                     end.text = proxy
     for tag in ("static", "self_collide"):
         for element in model.each(tag):
-            element.note("not used in a merged include: the model around it decides")
+            element.omit("not used in a merged include: the model around it decides")
     left_out = {"pose", "placement_frame", "static", "self_collide"}
     return [frame, *(child for child in model.children if child.tag not in left_out)]
 
@@ -201,10 +219,10 @@ def _rebase(element: Element, proxy: str) -> None:
 
 
 def _read(root: Element) -> Scope:
-    """The world in a file; a model without one stands in an empty world."""
+    """The world of a file; a model without a world gets an empty one."""
     worlds = root.each("world")
     for other in worlds[1:]:
-        other.note("only the first world of a file is converted")
+        other.omit("only the first world of a file is converted")
     element = worlds[0] if worlds else root
     if worlds and not worlds[0].name:
         worlds[0].problem("the <world> has no name")
@@ -224,7 +242,7 @@ def _grow(scope: Scope) -> tuple[list[Branch], list[Joint]]:
         if not bodies.is_known(joint) or element.name not in inner.frames:
             continue
         if all(end is None or end.is_static for end in ends):
-            element.note("left out: neither of its ends can move")
+            element.omit("left out: neither of its ends can move")
         elif ends[0] is ends[1]:
             element.problem("joins a link to itself, or to a link that does not exist")
         else:
@@ -240,26 +258,8 @@ def _end(scope: Scope, joint: Element, side: str) -> Link | None:
     return scope.body(name, joint.child(side) or joint)
 
 
-def _build(building: Building, scope: Scope, branches: list[Branch], loops: list[Joint]) -> None:
-    if scope.element.tag == "world":
-        _read_world(building, scope)
-    for branch in branches:
-        bodies.add_body(building, branch)
-    links.share_masks(building)
-    for branch in branches:
-        if branch.joint is not None:
-            links.add_joint_sensors(building, branch.link, branch.joint, is_turned=branch.is_turned)
-    for joint in loops:
-        bodies.close_loop(building, joint)
-    bodies.add_mimics(building, scope)
-    bodies.add_actuators(building, scope)
-    links.add_frames(building, scope)
-    links.add_lights(building, scope)
-    _exclude_contacts(building, scope)
-
-
 def _exclude_contacts(building: Building, scope: Scope) -> None:
-    """Links of one model do not collide with each other, unless it says so."""
+    """Exclude contacts between links of one model, unless the model wants them."""
     groups: dict[int, list[str]] = {}
     for inner in scope.and_models():
         outer = inner.outermost
@@ -285,19 +285,19 @@ def _exclude_contacts(building: Building, scope: Scope) -> None:
 
 def _compiled(building: Building, root: Element) -> Any:
     try:
-        with warnings.catch_warnings(record=True) as heard:
+        with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            model, boxed = compile_boxed(building.spec, building.meshes.made, heard)
+            model, boxed = compile_boxed(building.spec, building.meshes.made, caught)
     except (ValueError, mujoco.FatalError) as error:
-        building.meshes.blame()
+        building.meshes.report_unusable()
         root.report.raise_any()
-        root.problem(f"MuJoCo cannot compile the converted model: {said_by(error)}")
+        root.problem(f"MuJoCo cannot compile the converted model: {message_of(error)}")
         root.report.raise_any()
         raise
     why = {geom.name: str(slab) for geom, slab in boxed}
     for name, mesh in building.colliding_meshes.items():
         mesh.remark(why.get(name, "MuJoCo collides the convex hull of a mesh"))
-    for warning in heard:
+    for warning in caught:
         root.remark(f"MuJoCo: {' '.join(str(warning.message).split())}")
     return model
 
@@ -309,6 +309,6 @@ def _read_world(building: Building, scope: Scope) -> None:
     option.magnetic = world.vector("magnetic_field", _MAGNETIC_FIELD_T)
     engines = world.each("physics")
     for unused in engines[1:]:
-        unused.note("only the first <physics> is used")
+        unused.omit("only the first <physics> is used")
     engine = engines[0] if engines else world.made("physics")
     option.timestep = engine.number("max_step_size", 0.001, positive=True)

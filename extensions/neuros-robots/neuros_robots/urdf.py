@@ -1,7 +1,7 @@
-"""URDF to an ``MjSpec``: MuJoCo reads it; meshes are found, unsupported elements listed.
+"""URDF to an ``MjSpec``, by MuJoCo's reader; meshes are found, unsupported elements listed.
 
-MuJoCo joins links that cannot move against each other, and leaves visuals out; both are switched
-off, so that the names of all links are there, unless the ``<mujoco>`` element says otherwise.
+By default MuJoCo merges links without a joint that moves, and drops visuals. Both are switched off,
+so that all links keep their names, unless the ``<mujoco>`` element says otherwise.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from neuros_robots.mjcf import (
     Triangles,
     compile_boxed,
     fill,
+    message_of,
     needs_conversion,
-    said_by,
     triangles_of,
     why_unread,
 )
@@ -47,7 +47,7 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
     """Read a URDF file.
 
     Raises:
-        DescriptionError: with every mesh that cannot be found, or what MuJoCo says of the rest.
+        DescriptionError: with every missing mesh, or MuJoCo's error about the rest.
     """
     report = Report()
     root = parse(file, report)
@@ -61,7 +61,16 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
     unread = _resolve_meshes(root, finder)
     report.raise_any()
     robot = _copy(root)
-    _keep_names(robot)
+    block = robot.find("mujoco")
+    if block is None:
+        block = ElementTree.SubElement(robot, "mujoco")
+    compiler = block.find("compiler")
+    if compiler is None:
+        compiler = ElementTree.SubElement(block, "compiler")
+    for key, value in _KEPT_NAMES.items():
+        compiler.attrib.setdefault(key, value)
+    compiler.attrib.pop("meshdir", None)
+    compiler.set("strippath", "false")
     made: dict[str, Triangles] = {}
     try:
         spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, "unicode"))
@@ -73,22 +82,22 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
                 made[mesh.name] = triangles
         for element in root.descendants():
             if element.tag in _UNSUPPORTED_ELEMENTS:
-                element.note(_UNSUPPORTED_ELEMENTS[element.tag])
+                element.omit(_UNSUPPORTED_ELEMENTS[element.tag])
             elif element.tag == "mimic" and element.parent is not None:
                 _mimic(spec, element, element.parent)
         model, boxed = compile_boxed(spec, made, [])
     except (ValueError, mujoco.FatalError) as error:
-        root.problem(f"MuJoCo cannot compile it: {said_by(error)}")
+        root.problem(f"MuJoCo cannot compile it: {message_of(error)}")
         report.raise_any()
         raise
     links = {element.name: element for element in root.descendants() if element.tag == "link"}
     for geom, slab in boxed:
         links.get(geom.parent.name, root).remark(str(slab))
-    return Converted(spec, report.not_taken(), made, model.nbody - 1, model.njnt)
+    return Converted(spec, report.differences(), made, model.nbody - 1, model.njnt)
 
 
 def _check_numbers(element: Element) -> None:
-    """Report numbers that are infinite or none, which MuJoCo takes, or a joint's follower."""
+    """Report infinite numbers, which MuJoCo accepts, and a ``<mimic>`` without numbers."""
     if element.tag in _UNSUPPORTED_ELEMENTS:
         return
     for key, text in element.attributes.items():
@@ -96,7 +105,7 @@ def _check_numbers(element: Element) -> None:
             try:
                 is_wrong = not math.isfinite(float(word))
             except ValueError:
-                is_wrong = element.tag == "mimic"  # of others MuJoCo says so
+                is_wrong = element.tag == "mimic"  # MuJoCo reports the others
             if is_wrong:
                 element.problem(f"{key} must be finite, not '{word}'")
     for child in element.children:
@@ -104,7 +113,7 @@ def _check_numbers(element: Element) -> None:
 
 
 def _resolve_meshes(root: Element, finder: Finder) -> set[str]:
-    """Give every mesh an absolute path; returns those that MuJoCo does not read."""
+    """Give every mesh an absolute path; returns the paths that need conversion."""
     unread: set[str] = set()
     here, compiler = root.file.parent, root.child("mujoco", "compiler")
     folder = Path("" if compiler is None else compiler.attributes.get("meshdir", ""))
@@ -129,24 +138,11 @@ def _resolve_meshes(root: Element, finder: Finder) -> set[str]:
     return unread
 
 
-def _keep_names(robot: ElementTree.Element) -> None:
-    block = robot.find("mujoco")
-    if block is None:
-        block = ElementTree.SubElement(robot, "mujoco")
-    compiler = block.find("compiler")
-    if compiler is None:
-        compiler = ElementTree.SubElement(block, "compiler")
-    for key, value in _KEPT_NAMES.items():
-        compiler.attrib.setdefault(key, value)
-    compiler.attrib.pop("meshdir", None)
-    compiler.set("strippath", "false")
-
-
 def _mimic(spec: Any, mimic: Element, joint: Element) -> None:
-    """MuJoCo's reader passes over ``<mimic>``: the joint follows another one."""
+    """Add the constraint of a ``<mimic>``, which MuJoCo's reader ignores."""
     leader = mimic.attributes.get("joint", "")
     if spec.joint(joint.name) is None or spec.joint(leader) is None:
-        mimic.note(f"one of '{joint.name}' and '{leader}' does not move in MuJoCo")
+        mimic.omit(f"one of '{joint.name}' and '{leader}' does not move in MuJoCo")
         return
     offset = float(mimic.attributes.get("offset", 0.0))
     ratio = float(mimic.attributes.get("multiplier", 1.0))
@@ -154,7 +150,7 @@ def _mimic(spec: Any, mimic: Element, joint: Element) -> None:
 
 
 def _copy(element: Element) -> ElementTree.Element:
-    """A copy that can be written as XML, in this order; prefixes of names may be undeclared."""
+    """A copy for ElementTree, which can write it; prefixes of names may be undeclared."""
     copy = ElementTree.Element(element.tag, element.attributes)
     copy.text = element.text
     copy.extend(map(_copy, element.children))

@@ -54,7 +54,7 @@ class Folder:
         converted = self.convert(f'<model name="robot">\n{inside}\n</model>')
         return {
             f"{note.place.rpartition(':')[2]} {note.path.removeprefix('model[robot]/')}": note.why
-            for note in converted.not_taken
+            for note in converted.differences
         }
 
 

@@ -98,7 +98,7 @@ def test_an_unsupported_element_is_listed_with_its_place(folder: Folder) -> None
 
 def test_the_same_thing_is_listed_once_and_counted(folder: Folder) -> None:
     links = "".join(link(name, "<enable_wind>true</enable_wind>") for name in "abc")
-    (note,) = folder.convert(f'<model name="robot">{links}</model>').not_taken
+    (note,) = folder.convert(f'<model name="robot">{links}</model>').differences
     assert note.count == 3
     assert str(note).endswith("MuJoCo simulates no such environment (and 2 more)")
 

@@ -104,7 +104,7 @@ def test_it_turns_as_it_is_told(model: Any) -> None:
 
 
 def test_what_it_loses_is_listed(converted: Any) -> None:
-    paths = {note.path.rpartition("/")[2]: note.count for note in converted.not_taken}
+    paths = {note.path.rpartition("/")[2]: note.count for note in converted.differences}
     assert paths["plugin[gz::sim::systems::Imu]"] == 2
     assert paths["sensor[whisker1_1_contact]"] == 24
     assert paths["clip"] == 3
