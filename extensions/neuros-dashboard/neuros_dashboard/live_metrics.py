@@ -1,6 +1,6 @@
-"""A run as the pages of the dashboard see it: live metrics from counters of its nodes.
+"""A run for the pages of the dashboard: live metrics from counters of its nodes.
 
-The supervisor is asked over the control channel only while a page is open.
+The supervisor is asked over the control channel, and only while a page is open.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from neuros.control import (
     LogRecord,
     LookAll,
     Message,
-    Metrics,
     NodeStatus,
     PhaseChanged,
     Report,
@@ -32,7 +31,7 @@ from neuros.errors import ControlError
 from neuros_dashboard.pages import Pages, data_url
 
 WINDOW_S = 1.0
-"""Rates and shares are those of about the last second."""
+"""Rates and shares are averages over about this time."""
 
 _STATES = ("executing", "waiting", "blocked", "idle", "registering", "scheduling", "paused")
 _COUNTS = ("sent", "outstanding", "received", "discarded", "unread")
@@ -48,14 +47,14 @@ _GEOMETRY_S = 20.0
 
 
 Pauses: TypeAlias = Sequence[tuple[int, int]]
-"""Start and end of times in which a node stood still, in nanoseconds."""
+"""Start and end of each pause of a node, in nanoseconds."""
 
 
 class Latency:
     """Latency of one connection: from the sending of a packet to the start of a hook on it.
 
-    Sender and receiver show themselves at different moments; what belongs together is told by the
-    packets' positions. Both count on the monotonic clock of one machine.
+    Sender and receiver report at different moments; positions of packets match the two ends. Both
+    use the monotonic clock of one machine.
     """
 
     def __init__(self) -> None:
@@ -63,23 +62,23 @@ class Latency:
         self._taken: deque[tuple[int, int, Pauses]] = deque(maxlen=_MOST_TAKEN)
         self._last_ms: deque[float] = deque(maxlen=5)
 
-    def sent(self, last: int, times_ns: Sequence[int]) -> None:
-        """The last packets sent have been up to position ``last``."""
+    def add_sent(self, last: int, times_ns: Sequence[int]) -> None:
+        """Add times of the last packets sent, the last one at position ``last``."""
         for position, time_ns in enumerate(times_ns, last - len(times_ns) + 1):
             self._sent_ns[position] = time_ns
         while len(self._sent_ns) > _MOST_SENT:
             self._sent_ns.popitem(last=False)
         self._match()
 
-    def taken(self, position: int, time_ns: int, paused_ns: Pauses = ()) -> None:
-        """A hook has started on a packet; its node stood still at times that do not count."""
+    def add_start(self, position: int, time_ns: int, paused_ns: Pauses = ()) -> None:
+        """Add the start of a hook on a packet; pauses of its node do not count as latency."""
         if not self._taken or self._taken[-1][0] != position:
             self._taken.append((position, time_ns, paused_ns))
             self._match()
 
     @property
     def ms(self) -> float | None:
-        """The mean over the last few, ``None`` before the first."""
+        """The mean of the last few, ``None`` before the first."""
         return fmean(self._last_ms) if self._last_ms else None
 
     def _match(self) -> None:
@@ -96,13 +95,12 @@ class Latency:
 
 
 class Speed:
-    """Growth of a counter, or of a time, over :data:`WINDOW_S`; one that goes back begins anew."""
+    """Growth per second of a value over :data:`WINDOW_S`; it begins anew where the value falls."""
 
     def __init__(self) -> None:
         self._points: deque[tuple[float, float]] = deque()
 
-    def note(self, now_s: float, value: float) -> None:
-        """It has that value now."""
+    def add(self, now_s: float, value: float) -> None:
         if self._points and value < self._points[-1][1]:
             self._points.clear()
         self._points.append((now_s, value))
@@ -111,7 +109,7 @@ class Speed:
 
     @property
     def per_s(self) -> float:
-        """0 before there are two values."""
+        """0 before the second value."""
         (first_s, first), (last_s, last) = self._points[0], self._points[-1]
         return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
 
@@ -119,9 +117,9 @@ class Speed:
 class Loss:
     """Packets of a best-effort connection that were lost on their way, so far.
 
-    Both ends show their counts at different moments, and what arrives while a hook executes is
-    taken in after it. So the receiver's count is compared with what had been sent shortly before it
-    last took in, and the least difference of a while counts: late packets are not lost.
+    Both ends report at different moments, and packets that arrive while a hook executes are counted
+    after it. So the receiver's count is compared with the number sent shortly before it last
+    received, and the least difference of a while counts, since late packets are not lost.
     """
 
     def __init__(self) -> None:
@@ -129,13 +127,12 @@ class Loss:
         self._missing: deque[tuple[float, float]] = deque()
         self.count = 0
 
-    def sent(self, now_s: float, count: int) -> None:
-        """So many have been sent by now."""
+    def add_sent(self, now_s: float, count: int) -> None:
         self._sent.append((now_s, count))
 
-    def received(self, now_s: float, taken_in_s: float, count: int) -> None:
-        """So many have arrived of those that were there when the receiver last took in."""
-        sent = self._sent_by(taken_in_s - _UNDER_WAY_S)
+    def add_received(self, now_s: float, received_s: float, count: int) -> None:
+        """Add the count of a receiver that last received at ``received_s``."""
+        sent = self._sent_by(received_s - _UNDER_WAY_S)
         if sent is None:
             return
         self._missing.append((now_s, sent - count))
@@ -144,7 +141,7 @@ class Loss:
             self._missing.popleft()
 
     def _sent_by(self, then_s: float) -> float | None:
-        """The count of packets sent by then, if known."""
+        """The number of packets sent by then, interpolated, if known."""
         for (a_s, a), (b_s, b) in itertools.pairwise(self._sent):
             if a_s <= then_s <= b_s:
                 return a + (b - a) * (then_s - a_s) / max(b_s - a_s, 1e-9)
@@ -153,11 +150,11 @@ class Loss:
 
 
 class LiveMetrics:
-    """Live metrics of all nodes and connections, with as much of the past as they need.
+    """Live metrics of all nodes and connections.
 
     Attributes:
         nodes, connections: by name, ready for JSON.
-        sim_time: simulated seconds, ``None`` where no node owns time.
+        sim_time: simulated seconds, ``None`` without a node that owns time.
     """
 
     def __init__(self) -> None:
@@ -171,14 +168,14 @@ class LiveMetrics:
 
     @property
     def real_time_factor(self) -> float | None:
-        """Simulated seconds per second: now, and of the whole run once that is over."""
+        """Simulated seconds per second: at present, or of the whole run once it is over."""
         if self._ended_factor is not None:
             return self._ended_factor
         speed = self._speeds.get(("sim", ""))
         return None if speed is None else speed.per_s
 
-    def take(self, status: NodeStatus) -> None:
-        """A node has shown itself."""
+    def update(self, status: NodeStatus) -> None:
+        """Update the metrics from the status of a node."""
         counters = status.counters
         if counters is None:
             self.nodes[status.node] = {"state": "loading", "cause": ""}
@@ -187,7 +184,23 @@ class LiveMetrics:
         if status.sim_time is not None:
             self.sim_time = status.sim_time
             self._speed("sim", "", now_s, status.sim_time)
-        self._take_node(status.node, metrics, now_s)
+        executing = metrics["executing"]
+        shares = {}
+        for state in _STATES:
+            spent = metrics["accounting"][state]
+            total_s = sum(spent.values()) if isinstance(spent, Mapping) else float(spent)
+            shares[state] = self._speed(f"share {state}", status.node, now_s, total_s)
+        self.nodes[status.node] = {
+            **metrics["state"],
+            "executing": executing["name"] if executing else None,
+            "shares": shares,
+            "hooks": {
+                hook: _hook(
+                    each, self._speed(f"hook {hook}", status.node, now_s, each["executions"])
+                )
+                for hook, each in metrics["hooks"].items()
+            },
+        }
         for name, outgoing in metrics["outgoing"].items():
             shown = self.connections.setdefault(name, {})
             shown |= {key: outgoing[key] for key in ("sent", "outstanding", "is_blocked")}
@@ -195,7 +208,7 @@ class LiveMetrics:
             if outgoing["is_reliable"]:
                 shown["lost"] = 0
             else:
-                self._losses.setdefault(name, Loss()).sent(now_s, outgoing["sent"])
+                self._losses.setdefault(name, Loss()).add_sent(now_s, outgoing["sent"])
         for name, incoming in metrics["incoming"].items():
             shown = self.connections.setdefault(name, {})
             shown |= {key: incoming[key] for key in ("received", "discarded", "unread")}
@@ -204,14 +217,14 @@ class LiveMetrics:
             if "sent" not in shown:  # an external topic, or a sender of another launcher
                 shown["rate_hz"] = rate_hz
             if name in self._losses:
-                executing = metrics["executing"]
-                taken_in_s = now_s - (executing["for_s"] if executing else 0.0)
-                self._losses[name].received(now_s, taken_in_s, incoming["received"])
+                received_s = now_s - (executing["for_s"] if executing else 0.0)
+                self._losses[name].add_received(now_s, received_s, incoming["received"])
                 shown["lost"] = self._losses[name].count
         for name, (last, times_ns) in counters.sent_ns.items():
-            self._latencies.setdefault(name, Latency()).sent(last, times_ns)
+            self._latencies.setdefault(name, Latency()).add_sent(last, times_ns)
         for name, (position, time_ns) in counters.taken_ns.items():
-            self._latencies.setdefault(name, Latency()).taken(position, time_ns, counters.paused_ns)
+            latency = self._latencies.setdefault(name, Latency())
+            latency.add_start(position, time_ns, counters.paused_ns)
         for name, latency in self._latencies.items():
             self.connections[name]["latency_ms"] = latency.ms
 
@@ -222,20 +235,28 @@ class LiveMetrics:
         real_time_factor: float | None,
         has_drained: bool,
     ) -> None:
-        """The run is over: counts are final, and rates and shares are those of the whole run.
+        """Set the final counts, and rates and shares of the whole run.
 
         Args:
-            reports: the last one of each node that has made one.
-            running_s: how long all nodes ran.
+            reports: the last report of each node.
+            running_s: time in which all nodes ran.
             real_time_factor: of that time.
-            has_drained: whether packets in flight were waited for.
+            has_drained: whether the run waited for packets in flight.
         """
         self.nodes = {name: {"state": "ended", "cause": ""} for name in self.nodes}
         ends: dict[str, dict[str, int]] = {}
         for name, report in reports.items():
             if report.metrics is None:
                 continue
-            self._end_node(name, report.metrics, running_s)
+            spent = time_budget_of(report.metrics, running_s)
+            self.nodes[name] = {
+                "state": "ended",
+                "cause": "",
+                "shares": {} if spent is None else spent.shares,
+                "hooks": {
+                    hook: _hook(each, None) for hook, each in report.metrics["hooks"].items()
+                },
+            }
             counted: list[tuple[str, dict[str, Any]]] = [
                 *((name, {**counts}) for name, counts in report.metrics["outgoing"].items()),
                 *((name, {**counts}) for name, counts in report.metrics["incoming"].items()),
@@ -260,40 +281,10 @@ class LiveMetrics:
             }
         self._ended_factor = real_time_factor
 
-    def _end_node(self, name: str, metrics: Metrics, running_s: float | None) -> None:
-        spent = time_budget_of(metrics, running_s)
-        self.nodes[name] = {
-            "state": "ended",
-            "cause": "",
-            "shares": {} if spent is None else spent.shares,
-            "hooks": {hook: _hook(each, None) for hook, each in metrics["hooks"].items()},
-        }
-
-    def _take_node(self, name: str, metrics: Metrics, now_s: float) -> None:
-        shares = {
-            state: self._speed(f"share {state}", name, now_s, _seconds(metrics, state))
-            for state in _STATES
-        }
-        executing = metrics["executing"]
-        self.nodes[name] = {
-            **metrics["state"],
-            "executing": executing["name"] if executing else None,
-            "shares": shares,
-            "hooks": {
-                hook: _hook(each, self._speed(f"hook {hook}", name, now_s, each["executions"]))
-                for hook, each in metrics["hooks"].items()
-            },
-        }
-
     def _speed(self, kind: str, name: str, now_s: float, value: float) -> float:
         speed = self._speeds.setdefault((kind, name), Speed())
-        speed.note(now_s, value)
+        speed.add(now_s, value)
         return speed.per_s
-
-
-def _seconds(metrics: Metrics, cause: str) -> float:
-    spent = metrics["accounting"][cause]
-    return sum(spent.values()) if isinstance(spent, Mapping) else float(spent)
 
 
 def _hook(figures: Mapping[str, Any], rate_hz: float | None) -> dict[str, Any]:
@@ -305,13 +296,13 @@ def _hook(figures: Mapping[str, Any], rate_hz: float | None) -> dict[str, Any]:
     }
 
 
-class LiveRun:
-    """A run as its pages see it: asks the supervisor while a page is open, and shows the answers.
+class ObservedRun:
+    """A run for its pages: asks the supervisor while a page is open, and publishes the answers.
 
     Args:
-        link: to the supervisor.
+        link: the link to the supervisor.
         names: the nodes of the run.
-        start_s: monotonic time from which the pages count.
+        start_s: monotonic time at which the time axis of the pages begins.
 
     Attributes:
         phase: the latest state of the run, for the pages.
@@ -332,9 +323,9 @@ class LiveRun:
         self.phase: dict[str, Any] = {"phase": "running", "is_paused": False}
 
     async def run(self) -> None:
-        """Until the run is over."""
+        """Serve the pages until the run is over."""
         loop = asyncio.get_running_loop()
-        self.tell(Watch())
+        self.send(Watch())
         loop.add_reader(self._link.fileno(), self._receive)
         asking = asyncio.create_task(self._ask())
         try:
@@ -344,13 +335,13 @@ class LiveRun:
             loop.remove_reader(self._link.fileno())
             self._link.close()
 
-    def tell(self, message: Message) -> None:
-        """Send to the supervisor, which always reads."""
+    def send(self, message: Message) -> None:
+        """Send to the supervisor, unless the run is over."""
         if not self._is_over.is_set():
             self._link.send(message)
 
     async def geometry(self, node: str) -> str | None:
-        """The geometry of a node's simulated world, as JSON; ``None`` if it shows none."""
+        """The geometry of a node's simulated world, as JSON; ``None`` without a world."""
         if node not in self._names:
             return None
         loop = asyncio.get_running_loop()
@@ -360,13 +351,6 @@ class LiveRun:
         except asyncio.TimeoutError:
             return None
 
-    def _wanted(self) -> Mapping[str, Mapping[str, Any]]:
-        """What pages show of packets and worlds, and the geometries that they wait for."""
-        wanted = self._pages.wanted()
-        for node in self._geometries:
-            wanted.setdefault(node, {}).setdefault(WORLD, {})["geometry"] = True
-        return wanted
-
     async def _ask(self) -> None:
         period_s = max(_PERIOD_S, _PER_NODE_S * len(self._names))
         while True:
@@ -374,8 +358,11 @@ class LiveRun:
             self._answered.clear()
             self._has_answered.clear()
             asked_s = time.monotonic()
-            self.tell(LookAll(self._wanted()))
-            # A node whose hook holds Python's global lock answers late: the others need not wait.
+            wanted = self._pages.wanted()
+            for node in self._geometries:
+                wanted.setdefault(node, {}).setdefault(WORLD, {})["geometry"] = True
+            self.send(LookAll(wanted))
+            # A node whose hook holds Python's global lock answers late: do not wait for it.
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._has_answered.wait(), _PATIENCE_S)
             self._show()
@@ -390,12 +377,12 @@ class LiveRun:
         if messages is None:
             self._is_over.set()
         for message in messages or ():
-            self._take(message)
+            self._handle(message)
 
-    def _take(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         match message:
             case NodeStatus(node):
-                self._metrics.take(message)
+                self._metrics.update(message)
                 self._show_samples(node, message.samples)
                 self._answered.add(node)
                 if self._answered >= self._names:

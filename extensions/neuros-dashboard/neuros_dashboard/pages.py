@@ -1,4 +1,4 @@
-"""Open pages of the dashboard: what they want to see, events, and pictures for them."""
+"""Open pages of the dashboard: the samples they want, their events, and pictures for them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FLAGS = ("all", "image", "spikes", "frames", "contacts")
 _LISTS = ("fields", "arrays")
 
 Wanted = Mapping[str, Mapping[str, Mapping[str, Any]]]
-"""By node and port, what is to be sampled (see :class:`neuros.node.sampling.Sampler`)."""
+"""By node and port, the parts to sample (see :class:`neuros.node.sampling.Sampler`)."""
 
 
 def wanted_of(asked: Any) -> Wanted:
@@ -37,7 +37,7 @@ class Page:
     """One open page.
 
     Attributes:
-        wanted: what it shows of packets.
+        wanted: the samples that it shows.
     """
 
     def __init__(self) -> None:
@@ -45,15 +45,15 @@ class Page:
         self._events: asyncio.Queue[str | None] = asyncio.Queue(_MOST_WAITING)
 
     def send(self, event: str, data: Any) -> None:
-        """Queue an event; a page that does not read loses the oldest ones."""
+        """Queue an event; a page that does not read loses its oldest events."""
         self._put(f"event: {event}\ndata: {json.dumps(data)}\n\n")
 
-    def part(self) -> None:
-        """Nothing more comes."""
+    def end(self) -> None:
+        """End the stream of events."""
         self._put(None)
 
     async def next_event(self) -> str | None:
-        """The next event, as server-sent events are written; ``None``: it was the last one."""
+        """The next event, in the form of server-sent events; ``None`` after the last."""
         return await self._events.get()
 
     def _put(self, item: str | None) -> None:
@@ -66,7 +66,7 @@ class Pages:
     """All pages.
 
     Attributes:
-        are_watched: set while some page is open.
+        are_watched, are_gone: set while some page, or none, is open.
     """
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class Pages:
         self.are_gone.set()
 
     def open(self) -> tuple[str, Page]:
-        """A new page, and its name."""
+        """Add a page; returns its name and the page."""
         self._number += 1
         name, page = str(self._number), Page()
         self._pages[name] = page
@@ -86,14 +86,14 @@ class Pages:
         return name, page
 
     def close(self, name: str) -> None:
-        """Forget a page."""
+        """Remove a page."""
         self._pages.pop(name, None)
         if not self._pages:
             self.are_watched.clear()
             self.are_gone.set()
 
-    def want(self, name: str, wanted: Wanted) -> bool:
-        """A page shows other things now; returns False if there is no such page."""
+    def set_wanted(self, name: str, wanted: Wanted) -> bool:
+        """Set the samples that a page shows; returns False if there is no such page."""
         page = self._pages.get(name)
         if page is None:
             return False
@@ -105,10 +105,10 @@ class Pages:
         for page in self._pages.values():
             page.send(event, data)
 
-    def part(self) -> None:
-        """The run is over: end all pages' streams once they have been read."""
+    def end(self) -> None:
+        """End all pages' streams once their events have been read."""
         for page in self._pages.values():
-            page.part()
+            page.end()
 
     def wanted(self) -> dict[str, dict[str, dict[str, Any]]]:
         """Samples that any page shows."""
@@ -130,7 +130,7 @@ _GREY, _RGB, _RGBA = 0, 2, 6
 
 
 def data_url(picture: Mapping[str, Any]) -> str | None:
-    """The picture as a ``data:`` URL, ``None`` if there is no way to show it."""
+    """The picture as a ``data:`` URL, ``None`` for an unknown compression."""
     encoding, data = picture["encoding"], base64.b64decode(picture["data"])
     if not picture["width"]:  # compressed: "jpeg", or "rgb8; jpeg compressed bgr8"
         kind = next((kind for kind in _MIME_TYPES if kind in encoding), None)
@@ -141,6 +141,7 @@ def data_url(picture: Mapping[str, Any]) -> str | None:
 
 
 def _as_png_pixels(encoding: str, data: bytes) -> tuple[int, bytes]:
+    """The PNG colour type and the pixels of an image in an encoding of ROS."""
     if encoding in ("rgb8", "8UC3"):
         return _RGB, data
     if encoding == "rgba8":
@@ -158,7 +159,7 @@ def _as_png_pixels(encoding: str, data: bytes) -> tuple[int, bytes]:
 
 
 def _stretched(values: array[Any]) -> bytes:
-    """Depths in grey, from the nearest to the farthest; what is not finite is black."""
+    """Depths in grey, from the nearest to the farthest; values that are not finite are black."""
     seen = [value for value in values if value - value == 0]
     low, high = min(seen, default=0), max(seen, default=0)
     scale = 255 / (high - low) if high > low else 0.0
@@ -171,10 +172,6 @@ def _png(width: int, height: int, colour: int, pixels: bytes) -> bytes:
     lines = b"".join(b"\0" + pixels[y * row : (y + 1) * row] for y in range(height))
     header = struct.pack(">IIBBBBB", width, height, 8, colour, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + b"".join(
-        _chunk(kind, data)
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
         for kind, data in ((b"IHDR", header), (b"IDAT", zlib.compress(lines, 1)), (b"IEND", b""))
     )
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))

@@ -1,6 +1,6 @@
 """Programs beside a run: ``dashboard`` serves its page, ``rerun`` feeds a Rerun viewer.
 
-The first line of their standard input says of which run.
+The first line of their standard input has their settings as JSON.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def feed_rerun() -> None:
     from neuros.control import TO_OBSERVERS
     from neuros.control.link import ControlLink
     from neuros_dashboard.rerun_feed import RerunFeed
-    from neuros_dashboard.visual_types import VisualTypes, look_on
+    from neuros_dashboard.visual_types import VisualTypes, observe
     from neuros_dashboard.web import await_server
     from neuros_dashboard.windows import open_page
 
@@ -38,17 +38,19 @@ def feed_rerun() -> None:
         told["project"], told["feed_url"], {name: source for name, (*_, source) in sources.items()}
     )
     link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
-    look_on(link, sources, feed.show)
+    observe(link, sources, feed.show)
     feed.close()
 
 
 def serve_dashboard() -> None:
-    """Answer the page until the run is over."""
+    """Serve the page until the run is over."""
     told = json.loads(sys.stdin.readline())
     listening = socket.socket(fileno=told["descriptor"])
-    if not _is_looked_at(listening):
+    # Wait until a browser opens the page, or the run ends.
+    readable, _, _ = select.select([listening, sys.stdin], [], [])
+    if listening not in readable:
         return
-    # Loading all this takes a fifth of a second of a core that the nodes can use.
+    # Importing the server takes 0.2 s of a core that the nodes can use.
     import asyncio
 
     asyncio.run(_serve(told, listening))
@@ -58,22 +60,16 @@ async def _serve(told: Mapping[str, Any], listening: socket.socket) -> None:
     from neuros.backends.control_sockets import connect_by
     from neuros.control import TO_OBSERVERS
     from neuros.control.link import ControlLink
-    from neuros_dashboard.live_metrics import LiveRun
+    from neuros_dashboard.live_metrics import ObservedRun
     from neuros_dashboard.pages import Pages
     from neuros_dashboard.server import Dashboard
 
     names, pages = tuple(told["names"]), Pages()
     link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
-    run = LiveRun(pages, link, names, told["start_s"])
+    run = ObservedRun(pages, link, names, told["start_s"])
     logs = {name: Path(path) for name, path in told["logs"].items()}
     dashboard = Dashboard(told["plan"], lambda: _Log(logs), _load(told, names), pages, run)
     await dashboard.serve(listening, told["token"], told["run"])
-
-
-def _is_looked_at(listening: socket.socket) -> bool:
-    """Wait until a browser opens the page; False if the run ends before."""
-    readable, _, _ = select.select([listening, sys.stdin], [], [])
-    return listening in readable
 
 
 def _load(told: Mapping[str, Any], names: tuple[str, ...]) -> Callable[[], Mapping[str, Any]]:
@@ -85,7 +81,7 @@ def _load(told: Mapping[str, Any], names: tuple[str, ...]) -> Callable[[], Mappi
 
     def load() -> Mapping[str, Any]:
         load = load_now()
-        # What is not a node's is this process.
+        # The rest of the run's processes is this one.
         load["groups"]["dashboard"] = load["groups"].pop(LAUNCHER)
         return load
 
@@ -93,13 +89,18 @@ def _load(told: Mapping[str, Any], names: tuple[str, ...]) -> Callable[[], Mappi
 
 
 class _Log:
-    """The new lines of the logs of a run, as the console shows them."""
+    """New lines of the logs of a run, in the form of the console."""
 
     def __init__(self, files: Mapping[str, Path]) -> None:
         from neuros.backends.console import LogTail
 
         self._lines: list[str] = []
-        self._tail = LogTail(files, self._take, colours=False, last_bytes=_LAST_LOG_BYTES)
+        self._tail = LogTail(
+            files,
+            lambda text: self._lines.extend(text.splitlines()),
+            colours=False,
+            last_bytes=_LAST_LOG_BYTES,
+        )
 
     def read(self) -> list[str]:
         self._tail.poll()
@@ -108,9 +109,6 @@ class _Log:
 
     def close(self) -> None:
         self._tail.close()
-
-    def _take(self, text: str) -> None:
-        self._lines += text.splitlines()
 
 
 if __name__ == "__main__":

@@ -16,9 +16,9 @@ from neuros_dashboard.visual_types import Mark, Numbers, Picture, Points, Pose, 
 
 _TIMELINE = "time"
 _TRAIL = 1000
-_HALF_SIZES = [[0.12, 0.08, 0.05]]  # a body for what has a pose, metres
+_HALF_SIZES = [[0.12, 0.08, 0.05]]  # of the box that stands for a pose, metres
 _AXES_M = 0.3
-# By encoding: channels, and where red, green, blue (and alpha) are among them.
+# The places of red, green, blue (and alpha) among the channels, by encoding.
 _COLOURS = {
     "rgb8": (0, 1, 2),
     "8UC3": (0, 1, 2),
@@ -42,7 +42,7 @@ class RerunFeed:
         self._recording.connect_grpc(url, default_blueprint=_blueprint(sources))
 
     def show(self, name: str, time_s: float, marks: Sequence[Mark]) -> None:
-        """Show what was found in packets of ``node.port`` up to ``time_s``."""
+        """Show the marks of packets of ``node.port`` up to ``time_s``."""
         path = name.replace(".", "/", 1)
         for mark in marks:
             self._recording.set_time(_TIMELINE, duration=getattr(mark, "time_s", time_s))
@@ -57,7 +57,7 @@ class RerunFeed:
                 self._recording.log(f"images/{path}", _image(mark.image))
 
     def close(self) -> None:
-        """Let the last marks arrive."""
+        """Flush the last marks, and disconnect."""
         self._recording.disconnect()
 
     def _show_pose(self, path: str, pose: Pose) -> None:
@@ -92,7 +92,7 @@ def _image(image: Mapping[str, Any]) -> Any:
 
 
 def _blueprint(sources: Mapping[str, VisualTypes]) -> Any:
-    """The world to the left, images and curves to the right; what there is not is left out."""
+    """A layout with the world to the left, images and curves to the right, as far as they exist."""
     left: list[Any] = []
     if any(source.is_in_space for source in sources.values()):
         left.append(rrb.Spatial3DView(origin="world", name="world"))

@@ -4,14 +4,14 @@
 method   path          what it does
 ======== ============= ===========================================================
 GET      /             the page
-GET      /static/...   what it consists of
+GET      /static/...   its scripts, styles and images
 GET      /world/NODE   the geometry of a node's simulated world
 GET      /events       a stream of server-sent events, as long as the page is open
-POST     /want         what the page shows of packets: ``{"page": ..., "wanted": ...}``
-POST     /do/pause     the run stands still
-POST     /do/resume    it goes on
-POST     /do/step      while it stands still, ``{"count": n}`` steps
-POST     /do/stop      it ends, drained, with exit code 0
+POST     /want         the samples that the page shows: ``{"page": ..., "wanted": ...}``
+POST     /do/pause     pauses the run
+POST     /do/resume    resumes it
+POST     /do/step      ``{"count": n}`` steps of a paused run
+POST     /do/stop      ends the run, drained, with exit code 0
 ======== ============= ===========================================================
 """
 
@@ -44,11 +44,11 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from neuros.control import End, Message, Pause, Resume, StepAll
-from neuros_dashboard.live_metrics import LiveRun
+from neuros_dashboard.live_metrics import ObservedRun
 from neuros_dashboard.pages import Pages, wanted_of
 
 STATIC = Path(__file__).parent / "static"
-_SHARED: Any = [("neuros", "javascript")]  # what draws pages of recorded runs, too
+_SHARED: Any = [("neuros", "javascript")]  # pages of recorded runs use these scripts, too
 _LOG_S = 0.2
 _LOAD_S = 1.0
 _KEPT_LINES = 1000
@@ -56,7 +56,7 @@ _CLOSING_S = 1
 _MOST_STEPS = 1_000_000
 _HEADERS = {
     "Cache-Control": "no-store",
-    # In a frame of another page, buttons could be clicked by those who do not see them.
+    # Another page could frame this one and trick its user into clicking buttons.
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:;"
     " style-src 'self' 'unsafe-inline'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -82,12 +82,12 @@ class LogSource(Protocol):
 
 
 class Dashboard:
-    """Serves one run until that is over.
+    """Serves one run until it is over.
 
     Args:
-        plan: what :func:`neuros_dashboard.web.project_view` tells of the project.
-        open_log: begins to read the logs, with the last lines that there are.
-        load: the load of the machine and of each node, since it was last asked; JSON-serialisable.
+        plan: the result of :func:`neuros_dashboard.web.project_view`.
+        open_log: opens the logs, at their last lines.
+        load: returns the load of the machine and of each node since its last call, for JSON.
         pages: shared with ``run``.
     """
 
@@ -97,17 +97,17 @@ class Dashboard:
         open_log: Callable[[], LogSource],
         load: Callable[[], Mapping[str, Any]],
         pages: Pages,
-        run: LiveRun,
+        run: ObservedRun,
     ) -> None:
         self._plan, self._open_log, self._load = plan, open_log, load
         self._pages, self._run = pages, run
         self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
 
     async def serve(self, listening: socket.socket, token: str, run: str) -> None:
-        """Answer requests until the supervisor hangs up."""
+        """Answer requests until the run is over."""
         config = uvicorn.Config(
             self.app(token, run),
-            log_level="error",  # anybody on this machine can make requests that are worth a warning
+            log_level="error",  # any user of this machine can cause warnings
             access_log=False,
             lifespan="off",
             timeout_graceful_shutdown=_CLOSING_S,
@@ -120,7 +120,7 @@ class Dashboard:
         finally:
             for task in tasks:
                 task.cancel()
-            self._pages.part()
+            self._pages.end()
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._pages.are_gone.wait(), _CLOSING_S)
             server.should_exit = True
@@ -139,7 +139,7 @@ class Dashboard:
             ],
             middleware=[Middleware(Access, token=token, run=run)],
         )
-        # To redirect from a path with a slash too many, Starlette would decode the query as UTF-8.
+        # Redirecting from a path with an extra slash, Starlette would decode the query as UTF-8.
         app.router.redirect_slashes = False
         return app
 
@@ -174,24 +174,24 @@ class Dashboard:
             name, wanted = str(asked["page"]), wanted_of(asked["wanted"])
         except _NOT_UNDERSTOOD:
             return JSONResponse({"error": "this is not a request of the dashboard's page"}, 400)
-        is_there = self._pages.want(name, wanted)
+        is_there = self._pages.set_wanted(name, wanted)
         return Response(status_code=204 if is_there else 410)
 
     async def _do(self, request: Request) -> Response:
         what = request.path_params["what"]
         if what in _REQUESTS:
-            self._run.tell(_REQUESTS[what])
+            self._run.send(_REQUESTS[what])
         elif what == "step":
             try:
                 count = int((await request.json())["count"])
             except _NOT_UNDERSTOOD:
                 return JSONResponse({"error": "how many steps?"}, 400)
-            self._run.tell(StepAll(min(count, _MOST_STEPS)))
+            self._run.send(StepAll(min(count, _MOST_STEPS)))
         else:
             return JSONResponse({"error": f"nothing is called '{what}'"}, 404)
         return Response(status_code=204)
 
-    # ------------------------------------------------------------------ what is read here
+    # ------------------------------------------------------------------ logs and load
 
     async def _read_logs(self) -> None:
         while True:
@@ -208,7 +208,7 @@ class Dashboard:
                     await asyncio.sleep(0)
             finally:
                 log.close()
-                self._lines.clear()  # the next page begins with the last lines of then
+                self._lines.clear()  # the next page begins with the last lines of its time
 
     async def _read_load(self) -> None:
         while True:
@@ -221,7 +221,7 @@ _LOCAL_NAMES = {"127.0.0.1", "localhost", "[::1]", "::1"}
 
 
 def _split(address: str) -> SplitResult:
-    """The parts of an address; of what is none, empty ones."""
+    """The parts of an address, empty ones for an invalid address."""
     try:
         return urlsplit(address)
     except ValueError:  # "//[" has half a pair of brackets
@@ -229,15 +229,15 @@ def _split(address: str) -> SplitResult:
 
 
 class Access:
-    """ASGI middleware that lets only the user's own browser through: it has the printed token.
+    """ASGI middleware that admits only the user's own browser, by the printed token.
 
-    The server listens on 127.0.0.1 only, but other users of the machine, and any page that the
-    user's browser shows, can reach that, too. So every request needs the token: once in the URL,
-    from then on in a cookie that no script can read. A request that a page of another origin has
-    made is refused, and so is one under another name for this machine (DNS rebinding).
+    The server listens on 127.0.0.1 only, but other users of the machine, and any page in the
+    user's browser, can reach it. So every request needs the token: once in the URL, then in a
+    cookie that scripts cannot read. Requests of pages of other origins are refused, and so are
+    those under another host name (DNS rebinding).
 
     Args:
-        run: the run's id, for the name of the cookie: cookies do not tell ports apart.
+        run: the run's id, part of the cookie's name, since cookies do not tell ports apart.
     """
 
     def __init__(self, app: ASGIApp, token: str, run: str) -> None:
@@ -269,7 +269,7 @@ class Access:
         return None
 
     def _welcome(self, request: Request) -> Response | None:
-        """Move the token from the address, which others may see, into a cookie."""
+        """Move the token from the address, which others may see, to a cookie by a redirection."""
         if "token" not in request.query_params:
             return None
         rest = [pair for pair in request.query_params.multi_items() if pair[0] != "token"]

@@ -12,26 +12,26 @@ from neuros.registry import Registry
 
 
 class PreparedViewer(Protocol):
-    """A viewer made ready for one run."""
+    """A viewer prepared for one run."""
 
     def start(self, run: Shown, reaper: Reaper) -> str:
-        """Open it, once there is a control socket; returns what to tell the user, as its address.
+        """Open the viewer, once there is a control socket; returns a message for the user.
 
         Raises ``EnvironmentFault``.
         """
 
     def finish(self) -> None:
-        """Close it with the run, also where it was not started."""
+        """Close the viewer, also where it was not started."""
 
 
 class Viewer(ABC):
-    """What shows runs, in a window or a page. An entry point of the group ``neuros.viewers``.
+    """Shows runs in a window or a page. An entry point of the group ``neuros.viewers``.
 
     Attributes:
-        name: in ``--viewer``; that of the entry point.
-        place: where it shows something, as in "in *the dashboard*".
-        ranks: what it shows: the ``graph`` of a run (``--node-graph``), what its ``packets`` say
-            (``--visualisations``). The viewer with the highest number that can be used is taken.
+        name: for ``--viewer``; also the name of the entry point.
+        place: for messages, as "the dashboard" in "shown in the dashboard".
+        ranks: rank by subject: the ``graph`` of a run (``--node-graph``), its ``packets``
+            (``--visualisations``). The usable viewer with the highest rank is chosen.
     """
 
     name: str
@@ -40,15 +40,15 @@ class Viewer(ABC):
 
     @abstractmethod
     def prepare(self, back_end: BackEnd, subject: str | None, port: int | None) -> PreparedViewer:
-        """Find what it needs to show a run of this back end.
+        """Prepare to show a run of this back end.
 
         Args:
-            subject: what it was chosen to show; ``None`` where it was asked for by its name.
+            subject: the subject to show; ``None`` if the user chose the viewer by name.
             port: the user's wish, for a viewer that serves a page.
 
         Raises:
-            EnvironmentFault: if it cannot be used here, in a few words.
-            UsageError: if it cannot have the port.
+            EnvironmentFault: the viewer cannot be used here; the text is a few words.
+            UsageError: the port is taken.
         """
 
 
@@ -56,18 +56,18 @@ VIEWERS: Registry[Viewer] = Registry("neuros.viewers", "viewer", Viewer)
 
 
 class Views:
-    """The viewers that a user asks for, made ready.
+    """The viewers that a user asks for.
 
     Args:
         back_end: of the run.
-        names: of the viewers that are asked for by name.
-        subjects: what else is to be shown, by the flag that asks for it: each is shown by the best
-            viewer that can be used here.
+        names: viewers chosen by name.
+        subjects: subjects to show, by the flag that asks for them: the best usable viewer of each
+            is chosen.
         port: for a viewer that serves a page.
 
     Raises:
-        UsageError: if there is no viewer of a name, or the port is taken.
-        EnvironmentFault: if something cannot be shown, with the reason.
+        UsageError: there is no viewer of a name, or the port is taken.
+        EnvironmentFault: a viewer or subject cannot be shown, with the reason.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Visual types: poses, points, numbers and pictures that viewers show of a run's packets.
 
-Poses and scans stand in one world, images beside it, and all other numbers are curves. The
-fields of an unknown message type are asked for once; its first numbers are shown.
+Poses and scans share one world; images are beside it, and other numbers are curves. Of an unknown
+message type the first numbers are shown, whose fields its first sample tells.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _MOST_BEAMS = 1500
 _PERIOD_S = 0.2
 _XYZ, _XYZW = ("x", "y", "z"), ("x", "y", "z", "w")
 
-# Where position and orientation are; "" for one that there is not.
+# Prefixes of position and orientation; "" for a missing one.
 _POSES = {
     "geometry_msgs/msg/Point": (".", ""),
     "geometry_msgs/msg/PointStamped": ("point.", ""),
@@ -40,14 +40,14 @@ _POSES = {
     "nav_msgs/msg/Odometry": ("pose.pose.position.", "pose.pose.orientation."),
     "sensor_msgs/msg/Imu": ("", "orientation."),
 }
-# What else is shown of a message; of the time, nothing: everything has one.
+# Further fields to show; none of the time, which every packet has.
 _NUMBERS: dict[str, list[str]] = {
     "rosgraph_msgs/msg/Clock": [],
     "sensor_msgs/msg/Imu": [
         f"{part}.{axis}" for part in ("angular_velocity", "linear_acceleration") for axis in _XYZ
     ],
 }
-_NOT_FINITE = ("nan", "inf", "-inf")  # as a sample tells them; the next may be a number
+_NOT_FINITE = ("nan", "inf", "-inf")  # in samples; the next value may be a number
 _SCAN = "sensor_msgs/msg/LaserScan"
 
 
@@ -69,7 +69,7 @@ class Points:
 
 @dataclass(frozen=True)
 class Numbers:
-    """Fields of a packet at a time, seconds; what is no number is left out."""
+    """Numeric fields of a packet at a time, seconds."""
 
     time_s: float
     values: Mapping[str, float]
@@ -77,7 +77,7 @@ class Numbers:
 
 @dataclass(frozen=True)
 class Picture:
-    """An image, as :mod:`neuros.node.sampling` encodes it."""
+    """An image, in the encoding of :mod:`neuros.node.sampling`."""
 
     image: Mapping[str, Any]
 
@@ -99,7 +99,7 @@ class VisualTypes:
 
     @property
     def has_numbers(self) -> bool:
-        """Whether there are curves to draw of it, or may be."""
+        """Whether the type has curves, or may have."""
         return self._numbers is None or bool(self._numbers)
 
     def wanted(self) -> dict[str, Any]:
@@ -120,7 +120,15 @@ class VisualTypes:
             if self.is_scan:
                 yield Points(_beams(sample["all"]))
             elif self._numbers is None:
-                self._numbers = _numbers_of(sample["all"])
+                # The first numbers that are the message's own.
+                self._numbers = [
+                    path
+                    for path, value in sample["all"].items()
+                    if (isinstance(value, int | float) or value in _NOT_FINITE)
+                    and not path.startswith("header.")
+                    and not path.endswith(".length")
+                    and "covariance" not in path
+                ][:MOST_NUMBERS]
         for row in sample.get("values", ()):
             yield from self._of_row(row[0], dict(zip(sample["fields"], row[1:], strict=True)))
 
@@ -128,7 +136,7 @@ class VisualTypes:
         if self._position or self._orientation:
             position = _vector(values, self._position, _XYZ) or (0.0, 0.0, 0.0)
             orientation = _vector(values, self._orientation, _XYZW)
-            if orientation is None or not any(orientation):  # as in a message that was not filled
+            if orientation is None or not any(orientation):  # all zeros: the message was not filled
                 orientation = (0.0, 0.0, 0.0, 1.0)
             yield Pose(time_s, position, orientation)
         numbers = {
@@ -145,23 +153,12 @@ class VisualTypes:
 def _vector(
     values: Mapping[str, float | None], prefix: str, axes: Sequence[str]
 ) -> tuple[float, ...] | None:
-    """``None`` where there is no such field, or it holds no number."""
+    """Numeric fields as a tuple; ``None`` where one is missing or not a number."""
     if not prefix:
         return None
     found = [values.get(f"{prefix}{axis}".lstrip(".")) for axis in axes]
     numbers = tuple(each for each in found if each is not None)
     return numbers if len(numbers) == len(axes) else None
-
-
-def _numbers_of(fields: Mapping[str, Any]) -> list[str]:
-    """The first numbers that a message has of its own."""
-    numbers = [
-        path
-        for path, value in fields.items()
-        if (isinstance(value, int | float) or value in _NOT_FINITE)
-        and not (path.startswith("header.") or path.endswith(".length") or "covariance" in path)
-    ]
-    return numbers[:MOST_NUMBERS]
 
 
 def _beams(scan: Mapping[str, Any]) -> list[tuple[float, float, float]]:
@@ -177,7 +174,7 @@ def _beams(scan: Mapping[str, Any]) -> list[tuple[float, float, float]]:
     return points
 
 
-def look_on(
+def observe(
     link: ControlLink,
     sources: Mapping[str, tuple[str, str, VisualTypes]],
     show: Callable[[str, float, Sequence[Mark]], None],
@@ -185,9 +182,9 @@ def look_on(
     """Ask for samples of packets until the run is over.
 
     Args:
-        link: to the supervisor; closed in the end.
-        sources: by name, the node and the port, and what is shown of it.
-        show: called with a name, the time since the start in seconds, and what was seen.
+        link: to the supervisor; closed at the end.
+        sources: node, port and visual types, by name.
+        show: called with a name, the time since the start in seconds, and the new marks.
     """
     names = {(node, port): name for name, (node, port, _) in sources.items()}
     begin_s = next_s = time.monotonic()
@@ -197,7 +194,10 @@ def look_on(
             now_s = time.monotonic()
             if now_s >= next_s:
                 next_s = now_s + _PERIOD_S
-                _ask(link, sources)
+                wanted: dict[str, dict[str, Any]] = {}
+                for node, port, source in sources.values():
+                    wanted.setdefault(node, {})[port] = source.wanted()
+                link.send(LookAll(wanted))
             if not select.select([link], [], [], max(0.0, next_s - now_s))[0]:
                 continue
             messages = link.receive()
@@ -211,10 +211,3 @@ def look_on(
                     for row in sample.get("values", ()):
                         row[0] -= begin_s
                     show(name, now_s - begin_s, list(sources[name][2].marks(sample)))
-
-
-def _ask(link: ControlLink, sources: Mapping[str, tuple[str, str, VisualTypes]]) -> None:
-    wanted: dict[str, dict[str, Any]] = {}
-    for node, port, source in sources.values():
-        wanted.setdefault(node, {})[port] = source.wanted()
-    link.send(LookAll(wanted))

@@ -19,7 +19,7 @@ from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import BackEnd, Reaper, Shown
 from neuros.project.dashboard import ARRAYS, IMAGES, SPIKES
 from neuros.project.graph import guarantee
-from neuros.project.model import Connection, Node, Port, Project
+from neuros.project.model import Node, Port, Project
 from neuros.project.names import Names
 from neuros_dashboard.viewer import Viewer
 from neuros_dashboard.windows import end_process, open_page
@@ -28,22 +28,22 @@ HOST = "127.0.0.1"
 PROGRAMS = "neuros_dashboard.programs"
 _RERUN_MEMORY = "512MB"
 _END_S = 3.0
-_START_S, _LOOK_S = 30.0, 0.1
+_START_S, _RETRY_S = 30.0, 0.1
 
 
 class _DashboardView:
     """Serves the dashboard of a run.
 
-    It listens as soon as this is made, so the address may be opened at once; requests wait until
-    the process is started, which loads what it needs when the first one comes. It ends when the
-    supervisor hangs up, or, if no page was open, with its standard input.
+    The socket listens from the constructor on, so the address may be opened at once; requests wait
+    until the process is started, which imports its server when the first one arrives. The process
+    ends with the run, or, if no page was open, with its standard input.
 
     Args:
         port: on 127.0.0.1; 0: any free one.
-        section: of the page, which is then opened in a browser.
+        section: of the page; given, the page is opened there in a browser.
 
     Raises:
-        UsageError: if the port is taken.
+        UsageError: the port is taken.
     """
 
     def __init__(self, port: int, section: str | None) -> None:
@@ -61,7 +61,7 @@ class _DashboardView:
                 " leave the option out for any free one"
             ) from error
         self._listening.listen(64)
-        # With the token that lets the reader in.
+        # The token in it admits the reader.
         self._url = f"http://{HOST}:{self._listening.getsockname()[1]}/?token={self._token}"
 
     def start(self, run: Shown, reaper: Reaper) -> str:
@@ -72,7 +72,7 @@ class _DashboardView:
         )
         reaper.watch(process.pid)
         self._listening.close()
-        _tell(
+        _send_settings(
             process,
             {
                 "run": run.run_id,
@@ -90,7 +90,7 @@ class _DashboardView:
         return f"dashboard: {self._url}"
 
     def finish(self) -> None:
-        """Let it tell its pages that the run is over, and end."""
+        """Close the process after its pages have the end of the run."""
         self._listening.close()
         process = self._process
         if process is None:
@@ -105,7 +105,10 @@ class _RerunView:
     """Serves a Rerun web viewer for a run, and feeds it with samples of the run's packets."""
 
     def __init__(self) -> None:
-        self._feed_port, self._web_port = _free_ports(2)
+        with socket.socket() as feed, socket.socket() as web:
+            for each in (feed, web):
+                each.bind((HOST, 0))
+            self._feed_port, self._web_port = feed.getsockname()[1], web.getsockname()[1]
         self._feed_url = f"rerun+http://{HOST}:{self._feed_port}/proxy"
         self._url = f"http://{HOST}:{self._web_port}/?url={quote(self._feed_url, safe=':/')}"
         self._processes: list[subprocess.Popen[bytes]] = []
@@ -114,14 +117,14 @@ class _RerunView:
         server = python_command("rerun", "--serve-web", "--bind", HOST)
         server += ["--port", str(self._feed_port), "--web-viewer-port", str(self._web_port)]
         server += ["--server-memory-limit", _RERUN_MEMORY, "--hide-welcome-screen"]
-        server += ["--newest-first"]  # who opens it late wants to see what is now
+        server += ["--newest-first"]  # a late viewer begins with the present
         feeder = python_command(PROGRAMS, "rerun", str(run.folder))
         log = run.folder / "rerun.log"
         for what, command in (("server of Rerun", server), ("feeder of Rerun", feeder)):
             process = start_sidecar(what, command, log, run.environment)
             self._processes.append(process)
             reaper.watch(process.pid)
-        _tell(
+        _send_settings(
             process,
             {
                 "project": run.project.name,
@@ -133,7 +136,7 @@ class _RerunView:
         return f"visualisations: {self._url}"
 
     def finish(self) -> None:
-        """End them with the run: the feeder by itself, then the server."""
+        """End the processes: the feeder by itself, then the server."""
         for process in reversed(self._processes):
             end_process(process, _END_S if process is self._processes[-1] else 0)
 
@@ -163,7 +166,7 @@ RERUN = _Rerun()
 
 
 def await_server(url: str) -> None:
-    """Until the server of a page answers. Raises ``OSError`` if it does not."""
+    """Wait until the server of a page answers. Raises ``OSError`` if it does not."""
     where = urlsplit(url)
     give_up_s = time.monotonic() + _START_S
     while True:
@@ -172,35 +175,27 @@ def await_server(url: str) -> None:
         except ConnectionRefusedError:
             if time.monotonic() > give_up_s:
                 raise
-            time.sleep(_LOOK_S)
+            time.sleep(_RETRY_S)
         else:
             return
 
 
-def _tell(process: subprocess.Popen[bytes], told: Mapping[str, Any]) -> None:
-    """Tell it on its standard input: a command line can be read by other users."""
+def _send_settings(process: subprocess.Popen[bytes], settings: Mapping[str, Any]) -> None:
+    """Write settings to standard input: other users could read a command line."""
     assert process.stdin is not None
     with contextlib.suppress(BrokenPipeError):
-        process.stdin.write(json.dumps(told).encode() + b"\n")
+        process.stdin.write(json.dumps(settings).encode() + b"\n")
         process.stdin.flush()
 
 
-def _free_ports(count: int) -> Sequence[int]:
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for each in sockets:
-            each.bind((HOST, 0))
-        return [each.getsockname()[1] for each in sockets]
-
-
-# ---------------------------------------------------------------------- what they get
+# ---------------------------------------------------------------------- the project for viewers
 
 
 def project_view(project: Project, names: Sequence[str]) -> dict[str, Any]:
     """The project for viewers, ready for JSON.
 
     Args:
-        names: the nodes of this run; the others run elsewhere, and nothing is seen of them.
+        names: the nodes of this run; the others run elsewhere and cannot be sampled.
     """
     return {
         "project": project.name,
@@ -213,7 +208,19 @@ def project_view(project: Project, names: Sequence[str]) -> dict[str, Any]:
             }
             for node in project.nodes
         ],
-        "connections": [_connection(c) for c in project.connections],
+        "connections": [
+            {
+                "name": str(connection),
+                "from": connection.source_node,
+                "output": connection.source_output,
+                "to": connection.destination_node,
+                "input": connection.destination_input,
+                "discard_limit": connection.discard_limit,
+                "window": connection.window,
+                "guarantee": guarantee(connection),
+            }
+            for connection in project.connections
+        ],
         "topics": list(_topics(project)),
         "sources": [
             source
@@ -224,21 +231,8 @@ def project_view(project: Project, names: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _connection(connection: Connection) -> dict[str, Any]:
-    return {
-        "name": str(connection),
-        "from": connection.source_node,
-        "output": connection.source_output,
-        "to": connection.destination_node,
-        "input": connection.destination_input,
-        "discard_limit": connection.discard_limit,
-        "window": connection.window,
-        "guarantee": guarantee(connection),
-    }
-
-
 def _topics(project: Project) -> Iterator[dict[str, Any]]:
-    """External topics: ``name`` is as in the project file, ``title`` as on the ROS graph."""
+    """External topics; ``name`` is from the project file, ``title`` from the ROS graph."""
     for node in project.nodes:
         for port in (*node.inputs, *node.outputs):
             if port.external_topic is not None:
@@ -259,7 +253,7 @@ def _topics(project: Project) -> Iterator[dict[str, Any]]:
 
 
 def _sources(node: Node, names: Names) -> Iterator[dict[str, Any]]:
-    """Ports whose packets can be sampled: outputs and external inputs."""
+    """Ports that can be sampled: outputs and external inputs."""
     for port in node.outputs:
         yield _source(node, port, port.name, port.name)
     for port in node.inputs:

@@ -57,7 +57,7 @@ DISPLAYS = {
     "visualization_msgs/msg/Marker": "Marker",
     "visualization_msgs/msg/MarkerArray": "MarkerArray",
 }
-"""By message type, the class of ``rviz_default_plugins`` that shows it."""
+"""The class of ``rviz_default_plugins`` for each message type."""
 
 _FIXED_FRAME = "map"
 _TOOLS = ("Interact", "MoveCamera", "Select", "FocusCamera", "Measure")
@@ -67,7 +67,7 @@ class ToolProcess:
     """A tool as a process of this machine, with the environment of a run.
 
     Raises:
-        EnvironmentFault: if it cannot be started.
+        EnvironmentFault: the process cannot be started.
     """
 
     def __init__(self, program: str, command: Sequence[str], run: Shown) -> None:
@@ -75,20 +75,20 @@ class ToolProcess:
         self._process = start_sidecar(program, command, log, run.environment, is_ours=False)
 
     def announce(self, reaper: Reaper) -> None:
-        """Have it ended if the launcher is killed."""
+        """Have the process ended if the launcher is killed."""
         reaper.watch(self._process.pid)
 
     def finish(self) -> None:
-        """End it with the run."""
+        """End the process."""
         self._process.terminate()
         end_process(self._process, _END_S)
 
 
 class ToolContainer:
-    """A tool in a container: the host's network and display, the run folder to read.
+    """A tool in a container with the host's network and display, and the run folder.
 
     Raises:
-        EnvironmentFault: if it cannot be started.
+        EnvironmentFault: the container cannot be started.
     """
 
     def __init__(
@@ -114,21 +114,21 @@ class ToolContainer:
             )
 
     def announce(self, reaper: Reaper) -> None:
-        """Have it removed if the launcher is killed."""
+        """Have the container removed if the launcher is killed."""
         reaper.clean_with(leftovers.__name__, engine_socket(self._engine))
 
     def finish(self) -> None:
-        """End it with the run."""
+        """End the container."""
         with contextlib.suppress(DockerException, requests.RequestException):
-            self._container.stop(timeout=_STOP_S)  # its window may have been closed long ago
+            self._container.stop(timeout=_STOP_S)  # fails if the user has closed the window
         self._engine.close()
 
 
 def end_process(process: subprocess.Popen[bytes], patience_s: float) -> None:
-    """Wait for the end of a sidecar process, and no longer than that."""
+    """Wait for the end of a sidecar process; kill it after ``patience_s``."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(patience_s)
-    process.kill()  # which does nothing to one that has ended
+    process.kill()  # has no effect on a process that has ended
     process.wait()
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
@@ -137,7 +137,7 @@ def end_process(process: subprocess.Popen[bytes], patience_s: float) -> None:
 
 
 class _Window:
-    """A tool on a run; ``path``: where it is, ``None``: in the image ``neuros_tools``."""
+    """A tool on a run; ``path`` is its program, ``None`` for the image ``neuros_tools``."""
 
     def __init__(
         self, program: str, path: str | None, arguments: Callable[[Shown], Sequence[str]]
@@ -191,7 +191,7 @@ def has_display(environ: Mapping[str, str] = os.environ) -> bool:
 
 
 def open_page(url: str) -> None:
-    """Open a page in a browser where there is a display; its address is printed in any case."""
+    """Open a page in a browser if there is a display."""
     import webbrowser
 
     if has_display():
@@ -201,7 +201,7 @@ def open_page(url: str) -> None:
 def find_tool(program: str, environ: Mapping[str, str] = os.environ) -> str | None:
     """The path of a tool, ``None`` if it is in the image ``neuros_tools``.
 
-    Raises ``EnvironmentFault``: in a few words why it cannot run here.
+    Raises ``EnvironmentFault`` with a short reason where the tool cannot run.
     """
     if not has_display(environ):
         raise EnvironmentFault(f"{program} needs a display")
@@ -212,7 +212,7 @@ def find_tool(program: str, environ: Mapping[str, str] = os.environ) -> str | No
 
 
 def find_tool_image(environ: Mapping[str, str] = os.environ) -> str | None:
-    """``None`` if there is the image, else in a few words why not."""
+    """``None`` if the image exists, else a short reason."""
     try:
         with contextlib.closing(connect(environ)) as engine:
             engine.images.get(TOOL_IMAGE)
@@ -226,7 +226,7 @@ def find_tool_image(environ: Mapping[str, str] = os.environ) -> str | None:
 
 
 def rviz_configuration(project: Project) -> str:
-    """The content of a ``.rviz`` file; connections of types that it does not show are left out."""
+    """The content of a ``.rviz`` file; connections of types without a display are left out."""
     displays = [_display("Grid", "Grid"), _display("TF", "TF"), *_displays(project)]
     configuration = {
         "Panels": [

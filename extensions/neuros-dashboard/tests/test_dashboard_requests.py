@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from neuros_dashboard.live_metrics import LiveRun
+from neuros_dashboard.live_metrics import ObservedRun
 from neuros_dashboard.pages import Pages
 from neuros_dashboard.server import Dashboard
 
@@ -25,7 +25,7 @@ class Server:
     def __init__(self) -> None:
         here, self._there = socket.socketpair()
         pages, link = Pages(), ControlLink(here, TO_OBSERVERS, "the supervisor")
-        run = LiveRun(pages, link, ("a",), 0.0)
+        run = ObservedRun(pages, link, ("a",), 0.0)
         dashboard = Dashboard({}, lambda: None, dict, pages, run)  # type: ignore[arg-type]
         self._app = dashboard.app(TOKEN, "0123456789abcdef")
         self._link = link

@@ -40,21 +40,21 @@ def test_rates_are_those_of_the_last_second() -> None:
     figures = LiveMetrics()
     for tenth in range(40):
         sent = tenth if tenth < 20 else 20 + (tenth - 20) * 10
-        figures.take(node_status("a", 100 + tenth / 10, outgoing=outgoing(sent)))
+        figures.update(node_status("a", 100 + tenth / 10, outgoing=outgoing(sent)))
     assert figures.connections[LINK]["rate_hz"] == pytest.approx(100.0)
 
 
 def test_the_rate_of_what_goes_back_begins_anew() -> None:
     figures = LiveMetrics()
     for tenth, sent in enumerate((50, 60, 70, 0, 10)):
-        figures.take(node_status("a", 100 + tenth / 10, outgoing=outgoing(sent)))
+        figures.update(node_status("a", 100 + tenth / 10, outgoing=outgoing(sent)))
     assert figures.connections[LINK]["rate_hz"] == pytest.approx(100.0)
 
 
 def test_a_connection_has_the_counters_of_both_its_ends() -> None:
     figures = LiveMetrics()
-    figures.take(node_status("b", 1.0, incoming=incoming(7, discarded=2)))
-    figures.take(node_status("a", 1.0, outgoing=outgoing(8, outstanding=1)))
+    figures.update(node_status("b", 1.0, incoming=incoming(7, discarded=2)))
+    figures.update(node_status("a", 1.0, outgoing=outgoing(8, outstanding=1)))
     shown = figures.connections[LINK]
     assert {key: shown[key] for key in ("sent", "received", "discarded", "outstanding")} == {
         "sent": 8,
@@ -67,7 +67,7 @@ def test_a_connection_has_the_counters_of_both_its_ends() -> None:
 def test_where_the_sender_is_not_seen_the_rate_is_that_of_arrivals() -> None:
     figures = LiveMetrics()
     for second in range(3):
-        figures.take(node_status("b", second, incoming=incoming(5 * second)))
+        figures.update(node_status("b", second, incoming=incoming(5 * second)))
     assert figures.connections[LINK]["rate_hz"] == pytest.approx(5.0)
 
 
@@ -81,24 +81,24 @@ def test_latency_is_told_by_the_positions_of_packets_whoever_shows_itself_first(
             node_status("b", 1.0, incoming=incoming(11), taken_ns={LINK: (11, 7_500_000)}),
         ]
         for each in statuses if is_sender_first else reversed(statuses):
-            figures.take(each)
-        figures.take(statuses[0])
+            figures.update(each)
+        figures.update(statuses[0])
         assert figures.connections[LINK]["latency_ms"] == pytest.approx(0.5)
 
 
 def test_the_time_of_a_pause_is_no_latency() -> None:
     figures = LiveMetrics()
-    figures.take(node_status("a", 1.0, outgoing=outgoing(1), sent_ns={LINK: (1, (1_000_000,))}))
+    figures.update(node_status("a", 1.0, outgoing=outgoing(1), sent_ns={LINK: (1, (1_000_000,))}))
     taken = {LINK: (1, 90_000_000)}
     paused = ((0, 500_000), (2_000_000, 89_500_000))
-    figures.take(node_status("b", 1.0, incoming=incoming(1), taken_ns=taken, paused_ns=paused))
+    figures.update(node_status("b", 1.0, incoming=incoming(1), taken_ns=taken, paused_ns=paused))
     assert figures.connections[LINK]["latency_ms"] == pytest.approx(1.5)
 
 
 def test_shares_are_seconds_of_each_state_per_second() -> None:
     figures = LiveMetrics()
-    figures.take(node_status("a", 1.0, executing={"f": 1.0}, waiting={"x": 2.0}))
-    figures.take(node_status("a", 2.0, executing={"f": 1.25}, waiting={"x": 2.5, "y": 0.25}))
+    figures.update(node_status("a", 1.0, executing={"f": 1.0}, waiting={"x": 2.0}))
+    figures.update(node_status("a", 2.0, executing={"f": 1.25}, waiting={"x": 2.5, "y": 0.25}))
     shares = figures.nodes["a"]["shares"]
     assert (shares["executing"], shares["waiting"]) == (0.25, 0.75)
 
@@ -106,7 +106,7 @@ def test_shares_are_seconds_of_each_state_per_second() -> None:
 def test_hooks_have_their_count_and_mean_time() -> None:
     figures = LiveMetrics()
     hooks = {"f": {"executions": 10, "busy_s": 0.05}, "g": {"executions": 0, "busy_s": 0.0}}
-    figures.take(node_status("a", 1.0, hooks=hooks))
+    figures.update(node_status("a", 1.0, hooks=hooks))
     hooks = figures.nodes["a"]["hooks"]
     assert hooks["f"] == {"executions": 10, "rate_hz": 0.0, "mean_ms": pytest.approx(5.0)}
     assert hooks["g"]["mean_ms"] is None
@@ -115,14 +115,14 @@ def test_hooks_have_their_count_and_mean_time() -> None:
 def test_the_real_time_factor_is_that_of_now() -> None:
     figures = LiveMetrics()
     assert figures.real_time_factor is None
-    figures.take(node_status("a", 10.0, sim_time=3.0))
-    figures.take(node_status("a", 11.0, sim_time=5.0))
+    figures.update(node_status("a", 10.0, sim_time=3.0))
+    figures.update(node_status("a", 11.0, sim_time=5.0))
     assert (figures.sim_time, figures.real_time_factor) == (5.0, 2.0)
 
 
 def test_a_node_that_loads_its_plugin_has_no_figures_yet() -> None:
     figures = LiveMetrics()
-    figures.take(NodeStatus("a", 1))
+    figures.update(NodeStatus("a", 1))
     assert figures.nodes == {"a": {"state": "loading", "cause": ""}}
 
 
@@ -136,8 +136,8 @@ def lost(sent: list[int], received: list[int], hooks: list[float] | None = None)
     for place, (out, arrived) in enumerate(zip(sent, received, strict=True)):
         now_s, for_s = 10 + 0.2 * place, hooks[place] if hooks else 0.0
         hook = {"name": "f", "for_s": for_s, "executions": 1} if for_s else None
-        figures.take(node_status("a", now_s, outgoing=outgoing(out, is_reliable=False)))
-        figures.take(node_status("b", now_s, incoming=incoming(arrived), hook=hook))
+        figures.update(node_status("a", now_s, outgoing=outgoing(out, is_reliable=False)))
+        figures.update(node_status("b", now_s, incoming=incoming(arrived), hook=hook))
     return int(figures.connections[LINK]["lost"])
 
 
@@ -161,16 +161,16 @@ def test_what_waits_for_a_hook_to_end_is_not_lost() -> None:
 
 def test_nothing_is_lost_on_a_reliable_connection() -> None:
     figures = LiveMetrics()
-    figures.take(node_status("a", 1.0, outgoing=outgoing(5)))
+    figures.update(node_status("a", 1.0, outgoing=outgoing(5)))
     assert figures.connections[LINK]["lost"] == 0
 
 
 def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     figures = LiveMetrics()
-    figures.take(
+    figures.update(
         node_status("a", 1.0, outgoing=outgoing(5, 1), sim_time=1.0, hook={"name": "f", "for_s": 1})
     )
-    figures.take(node_status("b", 1.0, incoming=incoming(1)))
+    figures.update(node_status("b", 1.0, incoming=incoming(1)))
     nothing = dict.fromkeys(STATES, 0.0) | {"executing": {}, "waiting": {}, "blocked": {}}
     ends = {
         "a": (

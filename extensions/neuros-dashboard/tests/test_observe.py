@@ -6,7 +6,7 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
-from neuros_dashboard.visual_types import Mark, Numbers, VisualTypes, look_on
+from neuros_dashboard.visual_types import Mark, Numbers, VisualTypes, observe
 
 from neuros.backends.control_sockets import UnixListener, connect
 from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, PhaseChanged, Watch
@@ -21,7 +21,7 @@ def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:
     shown: list[tuple[str, Sequence[Mark]]] = []
     sources = {"robot.imu": ("robot", "imu", VisualTypes("sensor_msgs/msg/Imu"))}
     observer = threading.Thread(
-        target=look_on, args=(link, sources, lambda name, _, marks: shown.append((name, marks)))
+        target=observe, args=(link, sources, lambda name, _, marks: shown.append((name, marks)))
     )
     observer.start()
     asked = []

@@ -1,4 +1,4 @@
-"""Learning: what it is trained with, and how what was trained runs.
+"""Learning: environments, datasets, and trained networks as nodes.
 
 :mod:`~neuros_learn.gym` makes a project an environment of Gymnasium,
 :mod:`~neuros_learn.datasets` makes recorded runs datasets, and :mod:`~neuros_learn.nir` runs

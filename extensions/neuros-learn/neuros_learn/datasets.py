@@ -44,17 +44,17 @@ Run: TypeAlias = "str | os.PathLike[str]"
 Names: TypeAlias = "str | Sequence[str]"
 
 _NEVER = np.iinfo(np.int64).max
-_MOST_JITTER = 0.5  # of the time between two steps
+_MOST_JITTER = 0.5  # relative to the time between two steps
 
 
 @dataclass(frozen=True)
 class Steps:
-    """The steps of a run, in the order in which they happened.
+    """The steps of a run, in order.
 
     Attributes:
         observation: by name, an array with a row per step: the packet that the action answers.
-        action: by name, an array with a row per step: the newest packet at its end.
-        time_s: when each step began: simulated time, or without it, wall time since the first.
+        action: by name, an array with a row per step: the newest packet at the end of the step.
+        time_s: start of each step: simulated time, or without it, wall time since the first.
     """
 
     observation: dict[str, Column]
@@ -66,7 +66,7 @@ class Steps:
 
 
 def steps(run: Run, observation: Names, action: Names) -> Steps:
-    """What a policy saw and did in a recorded run, step by step.
+    """The observations and actions of a recorded run, step by step.
 
     A step begins with each packet of the first observation, and ends before the next one. Actions
     are the newest packets that were sent before the step ended. Other observations are the newest
@@ -80,8 +80,8 @@ def steps(run: Run, observation: Names, action: Names) -> Steps:
             or ``node.output.field``. An image is an array ``(step, y, x[, channel])``.
 
     Raises:
-        UsageError: if there is no such output or field, if it holds no numbers, or arrays whose
-            length changes; for a run without steps.
+        UsageError: there is no such output or field, or it holds no numbers, or arrays of changing
+            length; or the run has no steps.
         EnvironmentFault: as :func:`neuros.bag.open`.
     """
     with neuros.bag.open(run) as bag:
@@ -89,7 +89,7 @@ def steps(run: Run, observation: Names, action: Names) -> Steps:
         done = [_Signal(bag, name) for name in _listed(action)]
     begins = seen[0].sent_ns
     ends = np.append(begins[1:], _NEVER)
-    # What a hook sends together is recorded one after the other: all of it is there by the answer.
+    # Packets that a hook sends together are recorded one after the other, all before the answer.
     answers = np.min([each.first_after(begins) for each in done], axis=0)
     has_answer = answers < ends
     seen_by = np.where(has_answer, answers, begins)
@@ -124,20 +124,20 @@ def minari(
 ) -> Any:
     """Write recorded runs as a dataset of Minari, an episode each, and return it.
 
-    The last step gives the observation that ends the episode, which is *truncated*. One name makes
+    The last step's observation ends the episode, which is *truncated*. One name makes
     a ``Box``, a list a ``Dict`` of boxes, as in :mod:`~neuros_learn.gym`. Source of the format: O.
-    Younis et al., "Minari", 2024; the library writes it, to where ``MINARI_DATASETS_PATH`` says.
+    Younis et al., "Minari", 2024; the library writes it into ``MINARI_DATASETS_PATH``.
 
     Args:
         dataset_id: ``name-v0``, or ``namespace/name-v0``.
         observation, action: as for :func:`steps`.
-        reward: called with what was observed when a step ended, and with its action.
-        options: those of ``minari.create_dataset_from_buffers``: ``author``, ``data_format``, ...
+        reward: called with the observation at the end of a step, and the step's action.
+        options: of ``minari.create_dataset_from_buffers``: ``author``, ``data_format``, ...
 
     Raises:
-        EnvironmentFault: if Minari is not installed.
-        UsageError: as :func:`steps`; for a run of one step.
-        ValueError: for a name that Minari refuses.
+        EnvironmentFault: Minari is not installed.
+        UsageError: as :func:`steps`; or a run has one step only.
+        ValueError: Minari refuses the name.
     """
     library("minari", "steps()")
     from minari import create_dataset_from_buffers
@@ -189,18 +189,18 @@ def lerobot(
     "LeRobot", 2024; the library writes it.
 
     Args:
-        folder: for the dataset; must not exist.
+        folder: of the dataset; must not exist.
         observation, action: as for :func:`steps`.
-        task: what the robot was to do, in a sentence.
+        task: the robot's task, in a sentence.
         fps: steps per second; if left out, the rate of the first observation in the first run.
         repo_id: name of the dataset, ``user/name``.
         options: those of ``LeRobotDataset.create``: ``robot_type``, ``use_videos`` (false if left
             out: images are stored without loss), ...
 
     Raises:
-        EnvironmentFault: if LeRobot is not installed.
-        UsageError: as :func:`steps`; if the folder exists; for images that have not 8 bits; if
-            ``fps`` is left out and the steps have no steady, whole rate.
+        EnvironmentFault: LeRobot is not installed.
+        UsageError: as :func:`steps`; or the folder exists; images do not have 8 bits; or ``fps`` is
+            left out and the steps have no steady, whole rate.
     """
     library("lerobot", "steps()")
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -226,7 +226,7 @@ def lerobot(
 
 
 class _Signal:
-    """A part of what an output has sent: a row per packet."""
+    """Values of an output or of one of its fields, a row per packet."""
 
     def __init__(self, bag: Bag, name: str) -> None:
         topic, field = _split(bag, name)
@@ -242,11 +242,11 @@ class _Signal:
         self.values = _values(topic, columns, name, field)
 
     def before(self, times_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.intp]:
-        """The place of the newest packet before each time, or at it; -1 where there is none."""
+        """The index of the newest packet at or before each time; -1 where there is none."""
         return np.searchsorted(self.sent_ns, times_ns, side="right") - 1
 
     def first_after(self, times_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """When the first packet after each time was sent."""
+        """The time of the first packet after each time."""
         sent_ns = np.append(self.sent_ns, _NEVER)
         return sent_ns[np.searchsorted(self.sent_ns, times_ns, side="right")]
 
@@ -262,7 +262,7 @@ def _split(bag: Bag, name: str) -> tuple[RecordedTopic, str]:
 
 
 def _values(topic: RecordedTopic, columns: Mapping[str, Column], name: str, field: str) -> Column:
-    """The numbers of a topic, or of one of its fields: of an image its pixels, else joined."""
+    """The numbers of a topic or field: an image's pixels, else all numeric columns joined."""
     if topic.type == IMAGE and field in ("", "data"):
         pixels = pixels_of(columns, "")
         if pixels is None:
@@ -278,23 +278,18 @@ def _values(topic: RecordedTopic, columns: Mapping[str, Column], name: str, fiel
             raise UsageError(f"'{name}': {topic.type} has no field '{field}' ({hint})")
     else:
         found = {k: c for k, c in fields.items() if not k.endswith(("stamp.sec", "stamp.nanosec"))}
-    numbers = [
-        plain.reshape(len(plain), math.prod(plain.shape[1:]))
-        for plain in (_plain(f"'{name}': {key}", column) for key, column in found.items())
-        if plain.dtype.kind in "biuf"
-    ]
+    numbers = []
+    for key, column in found.items():
+        plain = column
+        if column.dtype == object and all(isinstance(each, np.ndarray) for each in column):
+            if len({each.shape for each in column}) > 1:
+                raise UsageError(f"'{name}': {key} changes its length from packet to packet")
+            plain = np.stack([*column]) if len(column) else np.empty((0, 0))
+        if plain.dtype.kind in "biuf":
+            numbers.append(plain.reshape(len(plain), math.prod(plain.shape[1:])))
     if not any(column.shape[1] for column in numbers):
         raise UsageError(f"'{name}' holds no numbers")
     return np.concatenate(numbers, axis=1)
-
-
-def _plain(name: str, column: Column) -> Column:
-    """A column of arrays of one length as one array; every other as it is."""
-    if column.dtype != object or not all(isinstance(each, np.ndarray) for each in column):
-        return column
-    if len({each.shape for each in column}) > 1:
-        raise UsageError(f"{name} changes its length from packet to packet")
-    return np.stack([*column]) if len(column) else np.empty((0, 0))
 
 
 def _listed(names: Names) -> list[str]:
@@ -322,7 +317,7 @@ def _row(columns: Any, place: int) -> Any:
 
 
 def _space(episodes: Sequence[dict[str, Column]], names: Names) -> Any:
-    """The space of what was recorded; its bounds are those of the type of the numbers."""
+    """The space of recorded values; its bounds are those of their number type."""
     from gymnasium import spaces
 
     boxes: dict[str, Any] = {}
@@ -330,13 +325,17 @@ def _space(episodes: Sequence[dict[str, Column]], names: Names) -> Any:
         kind, shape = column.dtype, column.shape[1:]
         if any(each[name].shape[1:] != shape for each in episodes):
             raise UsageError(f"'{name}' has another length in one of the runs")
-        low, high = (-np.inf, np.inf) if kind.kind == "f" else _bounds(kind)
+        low, high = -np.inf, np.inf
+        if kind.kind == "b":
+            low, high = 0, 1
+        elif kind.kind != "f":
+            low, high = int(np.iinfo(kind).min), int(np.iinfo(kind).max)
         boxes[name] = spaces.Box(low, high, shape, kind.type)
     return boxes[names] if isinstance(names, str) else spaces.Dict(boxes)
 
 
 def _lerobot_frames(found: Steps) -> dict[str, Column]:
-    """By feature, a row per step; every image has three colours."""
+    """By feature, an array with a row per step; every image has three colours."""
     frames, numbers = {}, []
     for name, column in found.observation.items():
         if column.ndim == 2:
@@ -374,7 +373,7 @@ def _lerobot_features(
 
 
 def _whole_rate(found: Steps) -> int:
-    """Steps per second. Raises ``UsageError`` unless they are steady and a whole number."""
+    """Steps per second. Raises ``UsageError`` unless the rate is steady and whole."""
     between_s = np.diff(found.time_s)
     if not len(between_s) or between_s.min() <= 0:
         raise UsageError("the steps have no rate: give fps")
@@ -386,7 +385,3 @@ def _whole_rate(found: Steps) -> int:
             f" {1 / between_s.max():.4g} to {1 / between_s.min():.4g}): give fps"
         )
     return round(rate_hz)
-
-
-def _bounds(kind: np.dtype[Any]) -> tuple[int, int]:
-    return (0, 1) if kind.kind == "b" else (int(np.iinfo(kind).min), int(np.iinfo(kind).max))

@@ -1,7 +1,7 @@
 """Environments of Gymnasium whose world is a project: ``neuros.gym.make("project.json", ...)``.
 
 An environment steps a :class:`~neuros.api.session.Session`: an action is a packet for inputs that
-the session takes over, an observation is made of the newest packets of outputs, and an episode
+the session takes over, an observation consists of the newest packets of outputs, and an episode
 begins with a reset. Source of the interface: M. Towers et al., "Gymnasium: a standard interface for
 reinforcement learning environments", 2024.
 """
@@ -42,7 +42,7 @@ except ModuleNotFoundError as error:
 _NAME = re.compile(r"(?P<port>\w+\.\w+)(?P<field>(\.\w+)*)(\[(?P<shape>\d+(, *\d+)*)\])?")
 _STAMPS = ("Time", "Duration")
 _MOST_ROUNDS = 100
-"""Within so many after a reset each observed output has to send."""
+"""Within this number of rounds after a reset each observed output must send."""
 _SEEDS = 2**31
 _NOTHING: Mapping[str, tuple[Any, Any]] = {}
 _UNBOUNDED = (-np.inf, np.inf)
@@ -69,7 +69,7 @@ def make(
         )
 
     Args:
-        max_episode_steps: after so many an episode is ``truncated``.
+        max_episode_steps: the number of steps after which an episode is ``truncated``.
     """
     env = ProjectEnv(project, **arguments)
     return env if max_episode_steps is None else TimeLimit(env, max_episode_steps)
@@ -87,22 +87,22 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         action: an output, whose packets the environment sends in its place, or an input.
         observation: outputs.
         reward: called after each step with the environment.
-        done: likewise, whether the episode has come to its end (``terminated``). The end of the
-            project is one, too.
+        done: likewise; returns whether the episode is over (``terminated``). The end of the
+            project ends it, too.
         ranges: lowest and highest value by name: numbers, or arrays.
         model: MJCF file, relative to the project file, with the ranges of the actuators that an
             action drives; ``ranges`` come first.
         rounds, sim_s: length of a step, as for :meth:`Session.step`.
         initial_action: sent at each reset, for a project that waits for its first command.
-        options: those of :meth:`~neuros.api.project.Project.session`.
+        options: of :meth:`~neuros.api.project.Project.session`.
 
     Attributes:
         session: the run.
         action, observation: those of the last step.
 
     Raises:
-        UsageError: if a name is that of no port or field, or its numbers are not known; for a
-            negative length of a step.
+        UsageError: a name is that of no port or field, the number of its values is not known, or
+            the length of a step is negative.
         ProjectError, EnvironmentFault, RunError: as a session does.
     """
 
@@ -133,11 +133,12 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         taken = [
             end for name in _listed(action) for end in _inputs_behind(described, _split(name)[0])
         ]
-        with contextlib.suppress(EnvironmentFault):  # messages of its own are there later
-            self._lay_out(loaded, described, action, observation, ranges or {}, model)
+        # Reports mistakes before a session starts; types that the project builds exist only later.
+        with contextlib.suppress(EnvironmentFault):
+            self._resolve_names(loaded, described, action, observation, ranges or {}, model)
         self.session = loaded.session(backend=backend, take_over=taken, **options)
         try:
-            self._lay_out(loaded, described, action, observation, ranges or {}, model)
+            self._resolve_names(loaded, described, action, observation, ranges or {}, model)
         except BaseException:
             self.session.close()
             raise
@@ -152,10 +153,10 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode: reset the session with the next seed, and go on until there is all.
+        """Begin an episode: reset the session with the next seed, and run until all outputs sent.
 
         Raises:
-            UsageError: if an observed output does not send.
+            UsageError: an observed output does not send.
         """
         super().reset(seed=seed)
         episode = int(self.np_random.integers(_SEEDS)) if self._has_seeds else None
@@ -174,7 +175,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         )
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Send the action, let the project go on, and look. Raises ``RunError`` if it fails."""
+        """Send the action, step the project, and observe. Raises ``RunError`` if it fails."""
         self._send(action)
         goes_on = self.session.step(self._rounds, sim_s=self._sim_s)
         self.action, self.observation = action, self._observe()
@@ -187,7 +188,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
 
     # ------------------------------------------------------------------ inside
 
-    def _lay_out(
+    def _resolve_names(
         self,
         project: Project,
         described: Described,
@@ -196,7 +197,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         ranges: Mapping[str, tuple[Any, Any]],
         model: str | os.PathLike[str] | None,
     ) -> None:
-        """Find out which numbers there are. Raises as the class."""
+        """Find the numbers of all actions and observations. Raises as the class."""
         controls = {} if model is None else _controls(described, project.file.parent / model)
         self._actions = [_Numbers(described, name, ranges, controls) for name in _listed(action)]
         self._observations = [
@@ -226,9 +227,9 @@ class _Numbers:
     """Numbers of the messages of a port, as one array.
 
     Attributes:
-        name: as the user gave it, without brackets.
+        name: the user's name without brackets.
         port: ``node.port``.
-        inputs: for an output, those that it feeds.
+        inputs: of an action: the input, or those that the output feeds.
     """
 
     def __init__(
@@ -249,7 +250,8 @@ class _Numbers:
         if not leaves:
             known = ", ".join(f"{self.port}.{_path(leaf)}" for leaf in _numbers_of(self._kind, ""))
             raise UsageError(f"'{written}': there are no numbers of that name; there are {known}")
-        sizes = [_size(leaf) for leaf in leaves]
+        # The size of a sequence without a bound is None.
+        sizes = [1 if leaf.field.shape is Shape.SINGLE else leaf.field.size for leaf in leaves]
         free = [_path(leaf) for leaf, size in zip(leaves, sizes, strict=True) if size is None]
         if len(free) > 1 or (free and shape is None):
             raise UsageError(
@@ -280,12 +282,12 @@ class _Numbers:
             )
         except (ValueError, TypeError, OverflowError) as error:
             raise UsageError(f"range of {self.name}: {error}") from error
-        if not np.all(low <= high):  # nor is it with NaN
+        if not np.all(low <= high):  # false for NaN, too
             raise UsageError(f"range of {self.name}: the lowest value must be at most the highest")
         return spaces.Box(low, high, dtype=self._dtype.type)
 
     def read(self, message: Any) -> Any:
-        """The numbers of a message; raises ``UsageError`` if there are more or fewer of them."""
+        """The numbers of a message; raises ``UsageError`` if their number is another one."""
         values = self._get(message)
         if self._is_flat:
             return np.array(values, self._dtype).reshape(self._shape)
@@ -317,7 +319,7 @@ _CONVERT: Mapping[Sort, Callable[[Any], list[Any]]] = {
     Sort.INTEGER: lambda numbers: [round(number) for number in numbers.tolist()],
     Sort.FLOAT: lambda numbers: numbers.astype(float).tolist(),
 }
-"""From an array of numbers to values of a field."""
+"""Converters from an array of numbers to values of a field."""
 
 
 def _listed(names: str | Sequence[str]) -> Sequence[str]:
@@ -341,11 +343,7 @@ def _split(written: str) -> tuple[str, str, tuple[int, ...] | None]:
 
 
 def _port(project: Described, name: str, *, is_output: bool = False) -> Port:
-    """The output of that name; unless that is wanted, it may be an input.
-
-    Raises:
-        UsageError: if there is none.
-    """
+    """The output, or unless ``is_output`` also input, of a name; raises ``UsageError``."""
     ports = {
         f"{node.name}.{port.name}": port
         for node in project.nodes
@@ -359,11 +357,7 @@ def _port(project: Described, name: str, *, is_output: bool = False) -> Port:
 
 
 def _inputs_behind(project: Described, name: str) -> list[str]:
-    """The input itself, or the inputs that an output is connected to.
-
-    Raises:
-        UsageError: if there is none.
-    """
+    """The input of a name, or the inputs of an output's connections; raises ``UsageError``."""
     _port(project, name)
     ends = [
         f"{c.destination_node}.{c.destination_input}"
@@ -377,7 +371,7 @@ def _inputs_behind(project: Described, name: str) -> list[str]:
 
 
 def _controls(project: Described, model: Path) -> dict[str, tuple[Any, Any]]:
-    """By input that drives actuators of a model, their lowest and highest controls."""
+    """The lowest and highest controls of each input that drives actuators of a model."""
     import mujoco
 
     try:
@@ -397,7 +391,7 @@ def _controls(project: Described, model: Path) -> dict[str, tuple[Any, Any]]:
 
 
 def _numbers_of(kind: type, field: str) -> list[Leaf]:
-    """The fields with numbers; of time stamps only those that are named."""
+    """The numeric fields; those of time stamps only if they are named."""
     known, path = schema(kind), tuple(f"_{part}" for part in field.split(".")[1:])
     return [
         leaf
@@ -410,10 +404,6 @@ def _numbers_of(kind: type, field: str) -> list[Leaf]:
 
 def _path(leaf: Leaf) -> str:
     return ".".join(slot[1:] for slot in leaf.path)
-
-
-def _size(leaf: Leaf) -> int | None:
-    return 1 if leaf.field.shape is Shape.SINGLE else leaf.field.size
 
 
 def _dtype(leaf: Leaf) -> np.dtype[Any]:

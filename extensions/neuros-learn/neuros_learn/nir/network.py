@@ -1,8 +1,8 @@
-"""Steps a network in NIR with NumPy, as the library does that has written it.
+"""Steps a network in NIR with NumPy, in the way of the library that wrote it.
 
-NIR's equations are continuous, and a file tells no time step. All exporters here step by forward
-Euler, in single precision; where they differ is in :data:`EXPORTERS`, and in the parameters of a
-node. A neuron spikes where its potential is *above* its threshold.
+NIR's equations are continuous, and a file has no time step. All supported exporters step by forward
+Euler, in single precision; :data:`EXPORTERS` and the parameters of a node have their differences. A
+neuron spikes where its potential is *above* its threshold.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ _Step: TypeAlias = "Callable[[Values], Values]"
 _RESETS = ("subtract", "v_reset", "none")
 _TYPES = re.compile(r"std_msgs/msg/Float(32|64)(MultiArray)?")
 _TYPES_IN_WORDS = "std_msgs/msg/Float32MultiArray, Float32, Float64MultiArray or Float64"
-# ROS declares these itself.
+# ROS itself declares these parameters.
 _OF_ROS = ("use_sim_time", "start_type_description_service")
 
 
 @dataclass(frozen=True)
 class Discretisation:
-    """How time goes on in a network.
+    """The discretisation of a network in time.
 
     Attributes:
         exporter: the library that has written the file.
         dt: seconds of a step.
-        reset: what a spike does to the potential: takes the threshold off it, sets it to
-            ``v_reset``, or nothing.
-        reset_delay: whether it does so in the next step only, of snnTorch.
+        reset: the effect of a spike on the potential: ``subtract`` the threshold, set it to
+            ``v_reset``, or ``none``.
+        reset_delay: whether the reset waits for the next step (snnTorch only).
     """
 
     exporter: str = "nir"
@@ -65,13 +65,13 @@ class Discretisation:
 EXPORTERS: Mapping[str, Discretisation] = {
     "nir": Discretisation(),
     "snntorch": Discretisation("snntorch", reset="subtract", reset_delay=True),
-    # `to_nir` of Norse 1.1 writes dt * tau for tau, with dt = 1e-3 unless told otherwise.
+    # `to_nir` of Norse 1.1 writes dt * tau for tau, with dt = 1e-3 by default.
     "norse": Discretisation("norse", dt=1e-6),
 }
 
 
 def discretisation_of(parameters: Mapping[str, Any]) -> Discretisation:
-    """What the parameters of a node ask for; raises :class:`NetworkError`."""
+    """The discretisation that a node's parameters ask for; raises :class:`NetworkError`."""
     given = {name: value for name, value in parameters.items() if name not in _OF_ROS}
     known = ("exporter", "dt", "reset", "reset_delay")
     exporter, problems = given.get("exporter", "nir"), []
@@ -97,7 +97,7 @@ def discretisation_of(parameters: Mapping[str, Any]) -> Discretisation:
 
 
 class Network:
-    """A network in its state; stepped once with zeros and reset, so that all shapes are known.
+    """A network and its state. A trial step with zeros checks all shapes.
 
     Raises:
         NetworkError: the shapes of its nodes do not fit each other.
@@ -118,7 +118,7 @@ class Network:
     def reset(self) -> None:
         """Go back to the state before the first step."""
         parts = self._parts.items()
-        # What a neuron gave last: it is read where a loop goes back.
+        # The last outputs of neurons, for loops that go back.
         self._values = {
             path: np.zeros(np.shape(part.values["r"]), np.float32)
             for path, part in parts
@@ -130,7 +130,7 @@ class Network:
                 self._steps[path] = _step_of(part, self._how)
 
     def step(self, inputs: Mapping[str, Values]) -> dict[str, Values]:
-        """The outputs after one more step, by name; inputs have the shapes of :attr:`inputs`."""
+        """The outputs of the next step, by name; inputs have the shapes of :attr:`inputs`."""
         values = self._values
         for path, part in self._parts.items():
             if part.kind == "Input":
@@ -149,7 +149,7 @@ class Network:
 
 @contextmanager
 def _naming(path: str, part: Part) -> Iterator[None]:
-    """Whatever NumPy says to parameters that do not fit, it is told of which node."""
+    """Turn NumPy's errors about parameters that do not fit into errors about the node."""
     try:
         yield
     except (ArithmeticError, LookupError, MemoryError, TypeError, ValueError) as error:
@@ -158,7 +158,7 @@ def _naming(path: str, part: Part) -> Iterator[None]:
 
 
 def problems_of(node: Node, path: Path) -> list[str]:
-    """All that keeps the network in a file from running as a node."""
+    """All reasons why the network of a file cannot run as a node."""
     problems: list[str] = []
     graph, how = None, Discretisation()
     try:
@@ -177,7 +177,7 @@ def problems_of(node: Node, path: Path) -> list[str]:
 
 
 class _Check(PluginCheck):
-    """Reads the network of a node before a run, as far as this Python can."""
+    """Checks the network of a node before a run, as far as this Python can."""
 
     def problems(self, node: Node) -> Iterator[Problem]:
         if find_spec("h5py"):
@@ -207,7 +207,7 @@ def _at_network(node: Node, text: str, hint: str = "") -> Problem:
 def _port_problems(
     names: Sequence[str], ports: Sequence[Port], side: str, kind: str
 ) -> Iterator[str]:
-    """Ports have the names of the Inputs and Outputs of the network, and carry numbers."""
+    """Problems of ports, which must have the names of the network's Inputs and Outputs."""
     for port in ports:
         if port.name not in names:
             yield f"the network has no {kind} '{port.name}', as the {side} (it has {listed(names)})"
@@ -252,14 +252,14 @@ class _Neuron:
     """I, IF, LI, LIF, CubaLI or CubaLIF.
 
     ``i' = (-i + w_in x) / tau_syn``, ``v' = (v_leak - v + r i) / tau``, without a leak
-    ``v' = r i``. The coefficients are computed as snnTorch and Norse do it in their exporters, so
-    that a weight of exactly 1 there is one here.
+    ``v' = r i``. The coefficients are computed as in the exporters of snnTorch and Norse, so that a
+    weight of exactly 1 there is 1 here.
     """
 
     def __init__(self, part: Part, how: Discretisation) -> None:
         values, self._how = part.values, how
         self._has_current = "tau_syn" in values
-        # snnTorch's Leaky sets its potential to zero before it adds what comes in; others after.
+        # snnTorch's Leaky zeroes its potential before it adds its input; other neurons after.
         self._zeroes_all = self._has_current or part.is_recurrent
         self._decay, self._gain, self._rest = np.float32(1), _single(values["r"]), np.float32(0)
         self._keep, self._weight = np.float32(0), np.float32(1)
@@ -292,7 +292,10 @@ class _Neuron:
             x, self._i = jumped, jumped
             if self._how.exporter == "norse":
                 self._i = self._keep * jumped
-        was_over = self._was_over(self._v)
+        # snnTorch resets where the potential was above the threshold before this step.
+        was_over = np.zeros_like(self._v)
+        if self._threshold is not None and self._how.exporter == "snntorch":
+            was_over = (self._v > self._threshold).astype(np.float32)
         v, drive = self._v, self._gain * x
         if self._how.reset == "v_reset" and not self._zeroes_all:
             v = np.where(was_over, self._v_reset, v)
@@ -313,12 +316,6 @@ class _Neuron:
         self._v = v
         return spikes
 
-    def _was_over(self, v: Values) -> Values:
-        """Where the potential was above the threshold before this step: snnTorch resets then."""
-        if self._threshold is None or self._how.exporter != "snntorch":
-            return np.zeros_like(v)
-        return (v > self._threshold).astype(np.float32)
-
 
 def _coefficients(tau: Any, weight: Any, dt: float) -> tuple[Values, Values]:
     """``1 - dt / tau`` and ``weight dt / tau``, in the precision of the file."""
@@ -328,7 +325,7 @@ def _coefficients(tau: Any, weight: Any, dt: float) -> tuple[Values, Values]:
 
 
 class _Delay:
-    """Gives what came in ``delay`` seconds ago, rounded to steps; zeros before."""
+    """Returns its input of ``delay`` seconds ago, rounded to steps; zeros before."""
 
     def __init__(self, delay: Any, dt: float) -> None:
         self._steps = np.rint(np.asarray(delay, float) / dt)
@@ -350,7 +347,7 @@ class _Delay:
         return _single(np.take_along_axis(self._past, index[None], axis=0)[0])
 
 
-# ---------------------------------------------------------------------- nodes without
+# ---------------------------------------------------------------------- nodes without a state
 
 
 def _linear(values: Mapping[str, Any], x: Values) -> Values:
@@ -370,7 +367,7 @@ def _flatten(values: Mapping[str, Any], x: Values) -> Values:
 
 
 def _convolution(values: Mapping[str, Any], x: Values) -> Values:
-    """Of ``x`` (channels, *space) with weights (out, channels / groups, *kernel), as in PyTorch."""
+    """Convolve ``x`` (channels, *space) with (out, channels / groups, *kernel), as PyTorch."""
     weight, groups = values["weight"], int(values["groups"])
     out, channels, *kernel = weight.shape
     if groups < 1 or out % groups or x.shape[:1] != (channels * groups,):
@@ -405,7 +402,7 @@ def _windows(
     around: list[tuple[int, int]],
     dilation: list[int],
 ) -> Values:
-    """What lies under the kernel at each place: (channels, *places, *kernel)."""
+    """The values under the kernel at each place: (channels, *places, *kernel)."""
     spans = [d * (k - 1) + 1 for d, k in zip(dilation, kernel, strict=True)]
     if min(*kernel, *stride, *dilation, 1) < 1 or min(map(min, around)) < 0:
         raise ValueError("has a kernel, stride or dilation below 1, or padding below 0")
@@ -429,7 +426,7 @@ def _single(value: Any) -> Values:
 
 
 def _each(value: Any, dimensions: int) -> list[int]:
-    """One whole number per dimension, of which a file may have one for all."""
+    """One whole number per dimension; a file may have one for all."""
     array = np.asarray(value)
     if array.dtype.kind not in "iu" or array.size not in (1, dimensions):
         raise ValueError(f"needs {dimensions} whole numbers for each of its dimensions")
@@ -437,7 +434,7 @@ def _each(value: Any, dimensions: int) -> list[int]:
 
 
 def _of_shape(parameter: Any, x: Values) -> Any:
-    """A parameter that is one for all values, or one for each."""
+    """Check that a parameter has one value for all of ``x``, or one for each; returns it."""
     fits = parameter.ndim <= x.ndim and all(
         a in (1, b) for a, b in zip(parameter.shape[::-1], x.shape[::-1], strict=False)
     )

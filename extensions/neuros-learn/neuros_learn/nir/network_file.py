@@ -1,7 +1,7 @@
-"""Reads the graph of a network out of a file in NIR (HDF5), and puts its nodes in order.
+"""Reads the graph of a network in NIR from an HDF5 file, and orders its nodes.
 
-Files come from strangers: kinds, links and sizes are looked at before an array is read. Everything
-that is wrong is told at once. Source of the format: ``nir.serialization``, nir 1.0.8.
+Files come from strangers: kinds, links and sizes are checked before an array is read. All problems
+are reported together. Source of the format: ``nir.serialization``, nir 1.0.8.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from neuros.errors import NodeError
 from neuros.project.suggest import listed
 
 MOST_BYTES = 1 << 30
-"""Of all parameters of a file."""
+"""Size of all parameters of a file."""
 MOST_VALUES = 1 << 24
-"""That one node takes, gives or holds."""
+"""Number of values that one node receives, sends or holds."""
 _MOST_NODES, _MOST_EDGES, _DEEPEST, _LONGEST_NAME = 1000, 10_000, 20, 1000
 
 _LARGEST = float(np.finfo(np.float32).max)
@@ -49,15 +49,15 @@ PARAMETERS: Mapping[str, tuple[str, ...]] = {
     "CubaLI": ("tau_mem", "tau_syn", *_NEURON),
     "CubaLIF": ("tau_mem", "tau_syn", *_NEURON, "v_threshold"),
 }
-"""By the kinds of NIR that are supported, beside NIRGraph; a node needs all of them."""
+"""The required parameters of the supported kinds, beside NIRGraph."""
 NEURONS = ("I", "IF", "LI", "LIF", "CubaLI", "CubaLIF")
-"""Those with a state: what they gave in the last step is known before they are stepped."""
+"""Kinds with a state: their last outputs are known before a step."""
 _OPTIONAL = {"v_reset": 0.0, "w_in": 1.0}
 _DIMENSIONS = {"Conv1d": 3, "Conv2d": 4}
 
 
 class NetworkError(NodeError):
-    """All that is wrong with a network, or with the parameters of its node."""
+    """All problems of a network, or of the parameters of its node."""
 
     def __init__(self, problems: list[str]) -> None:
         self.problems = problems
@@ -66,7 +66,7 @@ class NetworkError(NodeError):
 
 @dataclass(frozen=True)
 class Part:
-    """A node of NIR: its kind, its parameters, and the nodes whose outputs it takes the sum of."""
+    """A node of NIR: its kind, its parameters, and the nodes whose outputs are summed as input."""
 
     kind: str
     values: Mapping[str, Any]
@@ -78,13 +78,13 @@ class Part:
 class Graph:
     """A network without nested graphs: nodes by path (``rnn/lif``), in the order of evaluation.
 
-    A source that comes later in this order is a neuron, of which the last step's output is taken.
+    A source that comes later in this order is a neuron, whose output of the last step is used.
     """
 
     parts: Mapping[str, Part]
 
     def names(self, kind: str) -> tuple[str, ...]:
-        """Of the nodes of a kind; of ``Input`` and ``Output`` those of the network itself."""
+        """The nodes of a kind; ``Input`` and ``Output`` are those of the network itself."""
         return tuple(sorted(path for path, part in self.parts.items() if part.kind == kind))
 
 
@@ -92,7 +92,7 @@ def read_graph(path: Path) -> Graph:
     """The network in a file.
 
     Raises:
-        NetworkError: it is no network in NIR, or has what is not supported.
+        NetworkError: the file holds no network in NIR, or an unsupported one.
     """
     try:
         import h5py
@@ -106,7 +106,7 @@ def read_graph(path: Path) -> Graph:
             reader.read(file)
     except NetworkError:
         raise
-    except Exception as error:  # whatever h5py raises on a damaged file
+    except Exception as error:  # h5py raises anything on a damaged file
         lines = str(error).splitlines() or [type(error).__name__]
         raise NetworkError([f"{path.name} is no network in NIR: {lines[0]}"]) from None
     if reader.problems:
@@ -115,11 +115,11 @@ def read_graph(path: Path) -> Graph:
 
 
 class _Reader:
-    """Reads nodes and edges, and notes what is wrong.
+    """Reads nodes and edges, and collects problems.
 
     Attributes:
         kinds: by path; ``NIRGraph`` for the nested ones.
-        feeders: by path, where its input comes from; of a nested graph its Input and Output.
+        feeders: by path, the sources of its input; a nested graph's are those of its Input.
     """
 
     def __init__(self, h5py: Any) -> None:
@@ -159,21 +159,18 @@ class _Reader:
                 text = f"node '{path}': NIR's {kind} is not supported"
                 self.problems.append(text if kind else f"node '{path}' has no type")
         for source, target in self._edges(group):
-            self._connect(prefix, source, target)
-
-    def _connect(self, prefix: str, source: str, target: str) -> None:
-        for name in (source, target):
-            if prefix + name not in self.kinds:
-                text = f"there is no node '{prefix}{name}', which an edge names"
+            missing = [name for name in (source, target) if prefix + name not in self.kinds]
+            if missing:
+                text = f"there is no node '{prefix}{missing[0]}', which an edge names"
                 self.problems.append(text)
-                return
-        start = self._end(prefix + source, "Output")
-        end = self._end(prefix + target, "Input")
-        if start and end and start not in self.feeders[end]:
-            self.feeders[end].append(start)
+                continue
+            start = self._end(prefix + source, "Output")
+            end = self._end(prefix + target, "Input")
+            if start and end and start not in self.feeders[end]:
+                self.feeders[end].append(start)
 
     def _end(self, path: str, kind: str) -> str:
-        """Where an edge begins or ends that names a nested graph."""
+        """The end of an edge at a node; at a nested graph, its Input or Output."""
         if self.kinds[path] != "NIRGraph":
             return path
         level = path.count("/") + 1
@@ -190,7 +187,7 @@ class _Reader:
             return
         if edges.ndim != 2 or edges.shape[1] != 2 or len(edges) > _MOST_EDGES:
             raise NetworkError([f"edges must be at most {_MOST_EDGES} pairs of names"])
-        for index in range(len(edges)):  # one by one: names of a file may share their bytes
+        for index in range(len(edges)):  # one by one: names of a malicious file may share bytes
             pair = edges[index]
             if max(map(len, pair)) > _LONGEST_NAME:
                 raise NetworkError([f"an edge has a name of more than {_LONGEST_NAME} bytes"])
@@ -216,7 +213,7 @@ class _Reader:
             self.problems.append(f"node '{path}' takes more than {MOST_VALUES} values")
 
     def _value(self, node: Any, name: str, path: str) -> Any:
-        """A number or an array of them; of ``padding`` a text, too."""
+        """A number or an array of numbers; ``padding`` may be a text."""
         dataset = self._child(node, name, self._h5py.Dataset)
         self._bytes_left -= dataset.nbytes
         if self._bytes_left < 0:
@@ -241,7 +238,7 @@ class _Reader:
         return str(dataset[()].decode("utf-8"))[:_LONGEST_NAME]
 
     def _child(self, group: Any, name: str, kind: type) -> Any:
-        """A group or dataset that lies in the file itself."""
+        """A group or dataset in the file itself, not behind a link."""
         link = group.get(name, getlink=True)
         found = group[name] if isinstance(link, self._h5py.HardLink) else None
         outside = getattr(found, "external", None) or getattr(found, "is_virtual", False)
@@ -257,8 +254,8 @@ class _Reader:
 def _in_order(reader: _Reader) -> dict[str, Part]:
     """The nodes in the order of evaluation, nested graphs resolved.
 
-    A loop is cut behind a neuron, whose last output is taken: as late in the loop as can be, so
-    that what comes in passes all nodes in one step, and only what goes back takes another one.
+    A loop is cut behind a neuron, as late in the loop as possible: inputs pass all nodes in one
+    step, and only values that go back take another step.
     """
     sources = _sources(reader)
     reach, depth = _reach(sources), _depth(sources)
@@ -287,7 +284,7 @@ def _in_order(reader: _Reader) -> dict[str, Part]:
 
 
 def _sources(reader: _Reader) -> dict[str, list[str]]:
-    """By path, the nodes that feed it; Inputs and Outputs of nested graphs are passed through."""
+    """The sources of each node; Inputs and Outputs of nested graphs are skipped."""
     inner = {p for p, kind in reader.kinds.items() if kind in ("Input", "Output") and "/" in p}
     resolved: dict[str, list[str]] = {}
 
@@ -313,7 +310,7 @@ def _sources(reader: _Reader) -> dict[str, list[str]]:
 
 
 def _reach(sources: Mapping[str, list[str]]) -> dict[str, set[str]]:
-    """By path, all nodes that its output gets to."""
+    """All nodes that each node's output reaches."""
     targets: dict[str, set[str]] = {path: set() for path in sources}
     for path, feeders in sources.items():
         for each in feeders:
@@ -330,7 +327,7 @@ def _reach(sources: Mapping[str, list[str]]) -> dict[str, set[str]]:
 
 
 def _depth(sources: Mapping[str, list[str]]) -> dict[str, int]:
-    """By path, how many edges it is away from the nearest Input."""
+    """The number of edges from the nearest Input to each node."""
     depth = {path: 0 for path, feeders in sources.items() if not feeders}
     fresh = set(depth)
     for level in range(1, len(sources) + 1):

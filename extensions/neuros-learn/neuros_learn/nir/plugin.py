@@ -33,17 +33,15 @@ def step(node: Any, *packets: Any) -> list[Any]:
             raise NodeError(text)
         values[name] = given.reshape(shape)
     found = network.step(values)
-    return [_packet(node, name, found[name]) for name in _OUTPUTS]
-
-
-def _packet(node: Any, name: str, values: Any) -> Any:
-    packet = node.make_packet(name)
-    if isinstance(packet.data, array):
-        code = packet.data.typecode
-        packet.data = array(code, values.astype(code).tobytes())
-    elif values.size == 1:
-        packet.data = values.item()
-    else:
-        text = f"output '{name}' carries one value, and the network gives {values.shape}"
-        raise NodeError(text)
-    return packet
+    made = []
+    for name in _OUTPUTS:
+        packet, out = node.make_packet(name), found[name]
+        if isinstance(packet.data, array):
+            code = packet.data.typecode
+            packet.data = array(code, out.astype(code).tobytes())
+        elif out.size == 1:
+            packet.data = out.item()
+        else:
+            raise NodeError(f"output '{name}' carries one value, and the network gives {out.shape}")
+        made.append(packet)
+    return made
