@@ -1,8 +1,8 @@
 """Program of an agent: runs nodes of a project for a launcher on another machine.
 
 The launcher starts it (``ssh pi@robot neuros agent``) and talks to it over its standard input and
-output. When it hears nothing more, or that is closed, all nodes end; its reaper sees to that where
-the agent itself is killed.
+output. When the launcher falls silent, or closes these, all nodes end; a reaper ends them where the
+agent itself is killed.
 """
 
 from __future__ import annotations
@@ -68,27 +68,23 @@ from neuros_cluster.pump import Pump
 if TYPE_CHECKING:
     from neuros.recording.system_load import LoadMonitor
 
-_BUSY_S, _QUIET_S = 0.05, 0.2
+_BUSY_S, _QUIET_S = 0.05, 0.2  # between two looks at the nodes
 _MOST_IN_FLIGHT_BYTES = 1 << 19
 _STOP_S = 5.0
 _KEPT_S = 7 * 24 * 3600.0
 
 
 def add_agent(agent: argparse.ArgumentParser) -> None:
-    """``launch`` starts the program on another machine."""
+    """Add the options of the program, which ``launch`` starts on another machine."""
     agent.add_argument("--in-image", action="store_true")
-    agent.set_defaults(command=_run_agent)
-
-
-def _run_agent(options: argparse.Namespace) -> int:
-    return Agent(is_in_image=options.in_image).run()
+    agent.set_defaults(command=lambda options: Agent(is_in_image=options.in_image).run())
 
 
 class Agent:
-    """Runs nodes until the launcher has ended them, or has gone.
+    """Runs nodes until the launcher ends them, or is gone.
 
     Args:
-        is_in_image: it is in a container, whose image has all that its nodes need.
+        is_in_image: whether it runs in a container, whose image has all that its nodes need.
     """
 
     def __init__(self, *, is_in_image: bool = False) -> None:
@@ -96,7 +92,7 @@ class Agent:
         read_from, write_to = os.dup(0), os.dup(1)
         with open(os.devnull, "rb") as nothing:
             os.dup2(nothing.fileno(), 0)
-        os.dup2(2, 1)  # what libraries print is none of the launcher's messages
+        os.dup2(2, 1)  # output of libraries must not mix with messages to the launcher
         self._inbox: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._pump = Pump(
             read_from, write_to, TO_AGENT, "the launcher", self._inbox.put, self._lose
@@ -116,7 +112,7 @@ class Agent:
         self._is_lost = self._is_over = self._has_started = False
 
     def run(self) -> int:
-        """Until the end; returns the exit code."""
+        """Run until the end; returns the exit code."""
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         for number in (signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: self._lose("ended by a signal"))
@@ -125,20 +121,27 @@ class Agent:
         python = platform.python_version()
         self._pump.send(Ready(__version__, python, platform.machine(), platform.node(), reached_at))
         try:
-            self._work()
+            pause_s = _QUIET_S
+            while not (self._is_lost or self._is_over):
+                message = self._next(pause_s)
+                if message is not None:
+                    self._handle(message)
+                pause_s = _BUSY_S if self._send_news() else _QUIET_S
         finally:
-            self._end_nodes()
+            # End the nodes that are left, with a signal first; most have noticed the end already.
+            for process in self._processes.values():
+                process.terminate()
+            end_s = time.monotonic() + _STOP_S
+            for process in self._processes.values():
+                process.wait(max(0.0, end_s - time.monotonic()))
+            end_now(tuple(self._processes.values()))
+            if self._reaper is not None:
+                self._reaper.finish()
+            if self._domain is not None:
+                self._domain.release()
             if not (self._is_lost and self._has_started) and self._run is not None:
                 shutil.rmtree(self._run, ignore_errors=True)
         return 1 if self._is_lost else 0
-
-    def _work(self) -> None:
-        pause_s = _QUIET_S
-        while not (self._is_lost or self._is_over):
-            message = self._next(pause_s)
-            if message is not None:
-                self._obey(message)
-            pause_s = _BUSY_S if self._look() else _QUIET_S
 
     def _next(self, pause_s: float) -> Message | None:
         try:
@@ -147,15 +150,15 @@ class Agent:
             return None
 
     def _lose(self, _: str) -> None:
-        """The launcher has gone. In the thread of the pump, or a signal handler."""
+        """Note that the launcher is gone. Runs in the pump's thread, or a signal handler."""
         self._is_lost = True
         self._inbox.put(None)
-        if not self._has_started:  # pip or a compiler may be at work, which its reaper ends
+        if not self._has_started:  # pip or a compiler may be running, which the reaper ends
             if self._run is not None:
                 shutil.rmtree(self._run, ignore_errors=True)
             os._exit(1)
 
-    def _obey(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         try:
             match message:
                 case Place():
@@ -171,7 +174,11 @@ class Agent:
                     if node in self._processes:
                         self._processes[node].kill()
                 case ReadThreads(node):
-                    self._read_threads(node)
+                    # In a thread of its own: reading may take seconds.
+                    reading = threading.Thread(
+                        target=self._read_threads, args=(node,), name="neuros-stacks", daemon=True
+                    )
+                    reading.start()
                 case Took(size):
                     self._in_flight_bytes -= size
                 case Examine():
@@ -253,12 +260,12 @@ class Agent:
         for name, text in given.items():
             path = self._run / name
             path.parent.mkdir(exist_ok=True)
-            path.touch(0o600)  # it holds keys
+            path.touch(0o600)  # the files hold keys
             path.write_text(text, "utf-8")
         machine = order.machine
         self._follower = Follower(self._run, names, machine, given.keys())
         listener = UnixListener(self._run)
-        # Found by its first digits as the run of the launcher is, and another run to the reapers.
+        # The first digits are those of the launcher's run; to reapers it is another run.
         run_id = order.run[:8] + os.urandom(4).hex()
         self._domain = choose_domain(int(order.environment["ROS_DOMAIN_ID"]), os.environ, False)
         session = Session(
@@ -287,31 +294,22 @@ class Agent:
             order.options, order.cores, self._pythons.paths, self._reaper, as_asked(os.environ)
         )
         if order.monitors_load:
-            self._watch_load(run_id, names)
+            from neuros.api.observation import check_observation, load_monitor
+
+            check_observation(monitors_load=True)
+            self._monitor = load_monitor(run_id, self._run, names, is_one_process=False)
+            self._monitor.start()
         started = ProcessLauncher(program).start(files, {**order.environment, **own})
         self._processes = {process.names[0]: process for process in started}
         self._pump.send(Started())
 
-    def _watch_load(self, run_id: str, names: list[str]) -> None:
-        from neuros.api.observation import check_observation, load_monitor
-
-        assert self._run is not None
-        check_observation(monitors_load=True)
-        self._monitor = load_monitor(run_id, self._run, names, is_one_process=False)
-        self._monitor.start()
-
     def _read_threads(self, node: str) -> None:
-        """Beside all else: it may take seconds."""
         process = self._processes.get(node)
+        threads = ProcessThreads() if process is None else process.threads()
+        self._pump.send(ThreadsRead(node, threads))
 
-        def read() -> None:
-            threads = ProcessThreads() if process is None else process.threads()
-            self._pump.send(ThreadsRead(node, threads))
-
-        threading.Thread(target=read, name="neuros-stacks", daemon=True).start()
-
-    def _look(self) -> bool:
-        """Send what has come since; returns whether that was anything."""
+    def _send_news(self) -> bool:
+        """Send grown files and ends of nodes; returns whether there is more to send."""
         has_sent = False
         assert self._follower is not None or not self._processes
         for name, process in tuple(self._processes.items()):
@@ -322,7 +320,7 @@ class Agent:
                     self._send(chunk)
                     has_sent = True
                     if how is None and self._is_full:
-                        # The others have their turn first when the launcher has taken this.
+                        # The other nodes come first when the launcher has received this.
                         self._processes[name] = self._processes.pop(name)
                         break
             if how is not None:
@@ -332,7 +330,7 @@ class Agent:
 
     @property
     def _is_full(self) -> bool:
-        """Whether as much is under way as the launcher gets at once."""
+        """Whether the launcher has yet to acknowledge the most bytes that are sent ahead."""
         return self._in_flight_bytes > _MOST_IN_FLIGHT_BYTES
 
     def _send(self, chunk: Chunk) -> None:
@@ -340,7 +338,7 @@ class Agent:
         self._pump.send(chunk)
 
     def _finish(self) -> None:
-        """Send the rest, as fast as the launcher takes it."""
+        """Send the rest, as fast as the launcher receives it."""
         load = None if self._monitor is None else self._monitor.stop()
         problem = None if self._monitor is None else self._monitor.failure
         for chunk in self._follower.rest() if self._follower is not None else ():
@@ -349,29 +347,16 @@ class Agent:
                 message = self._next(_QUIET_S)
                 if isinstance(message, Took):
                     self._in_flight_bytes -= message.size
-            if self._is_lost:  # nobody takes the rest, which stays here
+            if self._is_lost:  # the rest stays here
                 return
         self._pump.send(Finished(load, (problem,) if problem else ()))
         self._pump.end()
         self._pump.join()
         self._is_over = True
 
-    def _end_nodes(self) -> None:
-        """End what is left: politely, then by force."""
-        for process in self._processes.values():
-            process.terminate()  # those that are up have seen already that their launcher is gone
-        end_s = time.monotonic() + _STOP_S
-        for process in self._processes.values():
-            process.wait(max(0.0, end_s - time.monotonic()))
-        end_now(tuple(self._processes.values()))
-        if self._reaper is not None:
-            self._reaper.finish()
-        if self._domain is not None:
-            self._domain.release()
-
 
 class _Remarks(io.TextIOBase):
-    """What is said while environments are made, for the user at the launcher."""
+    """Sends the messages of making environments to the user at the launcher."""
 
     def __init__(self, pump: Pump) -> None:
         self._pump = pump
@@ -383,7 +368,7 @@ class _Remarks(io.TextIOBase):
 
 
 def remove_old_runs(cache: Path) -> None:
-    """What was left of runs whose launcher has gone is kept for a week."""
+    """Remove what runs without their launcher have left, after a week."""
     for run in (*(cache / RUNS).glob("*"), *(cache / RECEIVED).glob("*")):
         try:
             is_old = run.stat().st_mtime < time.time() - _KEPT_S

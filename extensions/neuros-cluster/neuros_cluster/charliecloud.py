@@ -1,8 +1,8 @@
 """The back end ``charliecloud``: each node in an unpacked image, without a daemon and without root.
 
-A node is a process of this machine that sees another root folder: ``ch-run`` makes that with a user
-namespace and becomes the node. The image is a folder that ``ch-convert`` has made of the one that
-Docker or podman has built.
+A node is a process of this machine with another root folder: ``ch-run`` makes it with a user
+namespace and becomes the node. ``ch-convert`` makes the image, a folder, from an image that Docker
+or podman has built.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from neuros.project.model import Node, NodeFile, Project
 _RUNNER = "ch-run"
 _INSTALL = "apt-get install charliecloud, or ask those who run the cluster"
 _PYTHON = Path("/opt/neuros/bin/python")
-"""Of every image that is built from a recipe."""
+"""The Python of every image that is built from a recipe."""
 _LIBRARY = Path("/neuros/lib")
 _FOLDER = "~/.local/share/neuros/images"
 _PROBE_S = 30.0
-_USER = {"USER": "neuros"}  # ch-run asks for a name
-# What the Python of the launcher, or a module file, has put there leads to the wrong libraries.
+_USER = {"USER": "neuros"}  # ch-run requires a name
+# The launcher's Python, or a module file, sets these, and they name the wrong libraries.
 _UNSET = ("PYTHONHOME", "PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD", "VIRTUAL_ENV")
 
 
 class Charliecloud(BackEnd):
-    """Runs where somebody asks for it."""
+    """The back end; no run chooses it by itself."""
 
     name = "charliecloud"
     place = "an unpacked image"
@@ -90,7 +90,7 @@ BACK_END = Charliecloud()
 
 
 class _Images(ProcessDeployment):
-    """Images for nodes: a process per node, with ``ch-run`` before its command."""
+    """A process per node, with ``ch-run`` before its command."""
 
     def __init__(self, nodes: Sequence[Node], images: Mapping[str, Path]) -> None:
         super().__init__(nodes)
@@ -111,39 +111,35 @@ class _Images(ProcessDeployment):
 
 
 def _inside(process: NodeProcess, node: NodeFile, image: Path) -> NodeProcess:
-    """The process in an image, where it sees the folders of the run under their own paths."""
+    """The process in an image with the folders of the run mounted under their own paths."""
     folders = node.folders
     seen = {folder: _LIBRARY / name for name, folder in libraries().items()}
     seen |= {path: path for path in (folders.project, folders.workspace, folders.run)}
     seen |= {python: python for python in node.messages}
     binds: list[str] = []
     for here, there in sorted(seen.items(), key=lambda pair: len(pair[1].parts)):
-        if here.is_dir():  # an installed NeuROS comes without a workspace
-            _make_mount_point(image, there)
+        if here.is_dir():  # an installed NeuROS has no workspace
+            # The image is mounted read-only, so ch-run cannot make the folder.
+            inside = image / there.relative_to("/")
+            try:
+                inside.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise EnvironmentFault(
+                    f"{inside}: {error.strerror}: the image needs this folder, to see {there}"
+                    " there; its owner can make it"
+                ) from error
             binds.append(f"--bind={here}:{there}")
     start = [_RUNNER, "--set-env", *binds, f"--cd={process.folder}", str(image), "--"]
     given = {key: value for key, value in process.environment.items() if key not in _UNSET}
     path = os.pathsep.join([*map(str, node.messages), str(_LIBRARY)])
     environment = {**_USER, **given, "HOME": "/tmp", "PYTHONPATH": path}
-    environment["XDG_CACHE_HOME"] = "/tmp/.cache"  # libraries' own; the launcher's is not seen
+    environment["XDG_CACHE_HOME"] = "/tmp/.cache"  # the launcher's is not mounted
     return replace(
         process,
         command=[*start, *process.command],
         node_program=[*start, *process.node_program],
         environment=environment,
     )
-
-
-def _make_mount_point(image: Path, there: Path) -> None:
-    """A folder of the image, which is mounted so that nodes cannot write to it."""
-    inside = image / there.relative_to("/")
-    try:
-        inside.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise EnvironmentFault(
-            f"{inside}: {error.strerror}: the image needs this folder, to see {there} there; its"
-            " owner can make it"
-        ) from error
 
 
 def _image(folder: Path, container: str) -> Path:
@@ -169,7 +165,7 @@ def _require_runner(environ: Mapping[str, str]) -> None:
 
 
 def _try_image(image: Path) -> None:
-    """Start something in an image, since a machine may allow no user namespaces."""
+    """Start a program in an image: a machine may forbid user namespaces."""
     try:
         done = subprocess.run(
             [_RUNNER, str(image), "--", "/bin/true"],

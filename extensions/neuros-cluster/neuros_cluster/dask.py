@@ -67,8 +67,8 @@ def _local_cluster(count: int | None) -> Iterator[Any]:
     """Worker processes on this machine, one run each at a time."""
     from distributed import LocalCluster
 
-    # Ctrl+C in a terminal is for this process: workers end their runs when it asks them to. They
-    # inherit the mask of the thread that starts them, and that the one of this thread.
+    # Ctrl+C in a terminal is for this process: it asks workers to end their runs. Workers inherit
+    # the signal mask of the thread that starts them, which inherits that of this thread.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         cluster = LocalCluster(
@@ -84,7 +84,7 @@ def _local_cluster(count: int | None) -> Iterator[Any]:
 
 def _check_versions(client: Any, distribution: str) -> None:
     """Check that each worker has the NeuROS of this process. Raises ``EnvironmentFault``."""
-    # A function of Python itself: what a worker cannot import would have it wait for ever.
+    # A function of Python itself: a worker would wait for ever for one that it cannot import.
     found = client.run(version, distribution, on_error="return")
     here = version(distribution)
     for worker, there in found.items():
@@ -100,8 +100,9 @@ def _check_versions(client: Any, distribution: str) -> None:
 def _resources_for(plan: SweepPlan, declared: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """The resources of a job, under the names by which workers declare theirs.
 
-    Dask counts only what its workers declare (``dask worker --resources "CPU=8 GPU=1"``), and a job
-    that asks for more than any of them has would wait for ever. Raises ``EnvironmentFault``.
+    Dask counts only the resources that workers declare (``dask worker --resources "CPU=8 GPU=1"``),
+    and a job that asks for more than any worker has would wait for ever. Raises
+    ``EnvironmentFault``.
     """
     needs = plan.resources
     wanted = {"cpu": needs.cpus, "memory": needs.mem_bytes, "gpu": needs.gpus}

@@ -1,8 +1,7 @@
-"""A back end whose nodes are on several machines, as a deployment file says.
+"""A back end whose nodes are on several machines, according to a deployment file.
 
-Nodes of this machine are the back end's own. Others are run by the agents of theirs; to the
-supervisor they look like any: it hears of them over the control channel, and their files are in the
-run folder.
+Nodes of this machine are the back end's own; agents run the others. To the supervisor all look
+alike: they report over the control channel, and their files are in the run folder.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ if TYPE_CHECKING:
 
 _PEERS = "ROS_STATIC_PEERS"
 _ANY_PORT = 9
-_MUCH_S = 0.1  # clocks that are further apart are worth a warning
+_MUCH_S = 0.1  # a larger difference of clocks causes a warning
 
 
 @dataclass
@@ -53,11 +52,11 @@ class Side:
     """A machine of a deployment, connected and prepared.
 
     Attributes:
-        nodes: those that it runs.
-        address: at which others reach it; ``here``: at which it reaches this machine.
+        nodes: the nodes that it runs.
+        address: its address for others; ``here``: the address of this machine for it.
         messages: folders of the message packages that were built there.
-        sent: how many files it had to be sent.
-        container: which its node is in, where the machine is a Docker engine.
+        sent: number of files that were sent.
+        container: the container of its node, where the machine is a Docker engine.
     """
 
     machine: Machine
@@ -75,7 +74,7 @@ class Side:
         return self.machine.host
 
     def described(self) -> str:
-        """What is known of it, in a line."""
+        """A line about the machine."""
         ready, clock = self.ready, self.machine.clock
         return (
             f"{self.host.way}: {ready.machine}, Python"
@@ -88,9 +87,9 @@ class Machines(Deployment):
     """Nodes on several machines.
 
     Args:
-        file: which node runs where.
-        inner: what starts those of this machine.
-        monitors_load: whether the others are to write their system load.
+        file: the deployment.
+        inner: starts the nodes of this machine.
+        monitors_load: whether the other machines write their system load.
     """
 
     def __init__(
@@ -111,14 +110,14 @@ class Machines(Deployment):
         self._inner = inner
 
     def connect(self, log: Log) -> Sequence[str]:
-        """Reach all machines and get them ready, side by side; returns their addresses."""
+        """Connect to all machines and prepare them, in parallel; returns their addresses."""
         hosts = self.file.used
         with ThreadPoolExecutor(max(1, len(hosts)), "neuros-machines") as threads:
             work = [threads.submit(self._sides_of, host, log) for host in hosts]
             try:
                 wait(work)
             except BaseException:  # Ctrl+C
-                self._let_go()
+                self._close_all()
                 raise
         sides, failed = results_of(work)
         self.sides = [side for of_host in sides for side in of_host]
@@ -138,12 +137,12 @@ class Machines(Deployment):
         return [*dict.fromkeys(side.address for side in self.sides)]
 
     def close(self) -> None:
-        """Hang up on all machines, whose agents then end what is left."""
-        self._let_go()
+        """Close all connections; the agents end what is left."""
+        self._close_all()
         self.sides = []
 
-    def _let_go(self) -> None:
-        """Close what was made last first: an engine after its containers."""
+    def _close_all(self) -> None:
+        # In reverse order: an engine after its containers.
         while self._held:
             self._held.pop().close()
 
@@ -173,11 +172,11 @@ class Machines(Deployment):
         with ThreadPoolExecutor(len(self.sides), "neuros-machines") as threads:
             for found in threads.map(lambda side: _bring_home(side, is_enough), self.sides):
                 faults += found
-        self._let_go()
+        self._close_all()
         return faults
 
     def node_there(self, file: NodeFile, side: Side) -> NodeFile:
-        """A node with all paths as it sees them on its machine."""
+        """A node with the paths of its machine."""
         there = side.machine.folders
         built = {_package(python): python.parent for python in side.messages}
         pairs = [
@@ -193,7 +192,7 @@ class Machines(Deployment):
         return replace(file, node=node, folders=there, messages=side.messages)
 
     def _sides_of(self, host: Host, log: Log) -> Sequence[Side]:
-        """One for all nodes there; where they are in containers, one for each."""
+        """One side for all nodes of a host; with containers, one for each node."""
         names = tuple(node for node, place in self.places.items() if place == host.name)
         if not host.docker:
             return [self._side(host, names, log)]
@@ -234,7 +233,7 @@ class Machines(Deployment):
 
 
 class _Launcher:
-    """Starts each node where it belongs (:class:`neuros.ports.Launcher`)."""
+    """Starts each node on its machine (:class:`neuros.ports.Launcher`)."""
 
     def __init__(self, machines: Machines, inner: Launcher, program: NodeProgram) -> None:
         self._machines = machines
@@ -275,7 +274,7 @@ class _Launcher:
     def _begin(self, side: Side, nodes: Sequence[NodeFile], environment: Mapping[str, str]) -> None:
         run = nodes[0].folders.run
         files = [file for file in nodes if file.node.name in side.nodes]
-        if side.container:  # they are built by now
+        if side.container:  # the packages are built by now
             side.messages = side.container.put_messages(files[0].messages)
         others = [side.here, *(each.address for each in self._machines.sides if each is not side)]
         if self._program.reaper:
@@ -309,7 +308,7 @@ class NodeElsewhere:
         return (self.name,)
 
     def poll(self) -> str | None:
-        """``None`` while it runs, then how it ended, in words."""
+        """``None`` while the node runs, then how it ended, in words."""
         return self.side.machine.end_of(self.name)
 
     @property
@@ -320,12 +319,12 @@ class NodeElsewhere:
         self.side.machine.kill(self.name)
 
     def threads(self) -> ProcessThreads:
-        """Where its threads stand in Python."""
+        """The positions of its threads in Python code."""
         return self.side.machine.threads_of(self.name)
 
 
 def _bring_home(side: Side, is_enough: Callable[[], bool]) -> Sequence[str]:
-    """Have what the nodes have left there sent here; returns what could not be had."""
+    """Copy the files of the nodes to this machine; returns problems."""
     machine, was_lost = side.machine, bool(side.machine.lost)
     side.left = machine.finish(is_enough)
     machine.move_times(side.nodes)
@@ -341,15 +340,15 @@ def _bring_home(side: Side, is_enough: Callable[[], bool]) -> Sequence[str]:
 
 
 def _renamed(text: str, there: str, here: str) -> str:
-    """Text with a path there as the one here; with a colon before it, it is meant to be there."""
+    """Replace a path there by the one here, except after a colon (``host:path``)."""
     return re.sub(rf"(?<![\w/.:]){re.escape(there)}\b", lambda _: here, text)
 
 
 def _texts(run: Path) -> dict[str, str]:
-    """What lies in a run folder before the nodes start: the project, the plan of the recording.
+    """The JSON files of a run folder before the nodes start, by name.
 
     Raises:
-        EnvironmentFault: if something there cannot be read.
+        EnvironmentFault: a file cannot be read.
     """
     found = {}
     for path in run.glob("*.json"):
@@ -388,7 +387,7 @@ def _record(side: Side) -> dict[str, Any]:
 
 
 def _address(host: Host, ready: Ready, reached_at: str) -> str:
-    """The IPv4 address at which other machines reach one. Raises ``EnvironmentFault``."""
+    """The IPv4 address of a machine for other machines. Raises ``EnvironmentFault``."""
     known = host.address or ("" if host.through else reached_at)
     for name in (known, ready.name):
         with contextlib.suppress(OSError):
@@ -402,12 +401,12 @@ def _address(host: Host, ready: Ready, reached_at: str) -> str:
 
 
 def _own_address(here: Host, address: str) -> str:
-    """The IPv4 address of this machine, as one at that address sees it."""
+    """The IPv4 address of this machine for the machine at an address."""
     if here.address:
         return _address(here, Ready("", "", "", ""), "")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.connect((address, _ANY_PORT))  # sends nothing: the kernel chooses the way
+            probe.connect((address, _ANY_PORT))  # sends nothing: the kernel chooses the route
         except OSError as error:
             raise EnvironmentFault(
                 f"this machine cannot reach {address} ({error.strerror}), the address of its nodes"

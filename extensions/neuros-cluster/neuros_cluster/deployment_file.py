@@ -1,6 +1,6 @@
 """Deployment files: which machine each node of a project runs on.
 
-A deployment stands apart from the project: an experiment does not know where it runs.
+A deployment is not part of the project: an experiment does not depend on where it runs.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 @dataclass(frozen=True)
 class Host:
-    """A machine, and how it is reached.
+    """A machine, and the way to reach it.
 
     Attributes:
         ssh: its destination for ``ssh``, as ``pi@robot``.
-        docker: the address of its Docker engine, as in ``DOCKER_HOST``, in the place of ``ssh``:
-            nodes run in containers there.
+        docker: the address of its Docker engine, as in ``DOCKER_HOST``, instead of ``ssh``: nodes
+            run in containers there.
         ssh_options: further arguments of ``ssh``.
-        through: a command that executes there what follows it, in the place of ``ssh``.
+        through: a command that executes its arguments there, instead of ``ssh``.
         neuros: the command ``neuros`` there.
-        address: by which the other machines reach it; empty: the one that ``ssh`` has used.
+        address: its address for other machines; empty: the one that ``ssh`` has used.
     """
 
     name: str
@@ -48,7 +48,7 @@ class Host:
 
     @property
     def way(self) -> str:
-        """How it is reached, in a word or a line."""
+        """The way to reach it, in a word or a line."""
         return self.ssh or self.docker or " ".join(self.through)
 
     def __str__(self) -> str:
@@ -61,9 +61,9 @@ class DeploymentFile:
 
     Attributes:
         hosts: the machines besides this one, by name.
-        places: by node, the name of its host; none: it runs here.
-        here: what the file says of this machine.
-        timeout_s: a machine that has given no sign of life for so long counts as gone.
+        places: the name of each node's host; nodes without one run here.
+        here: the entry of this machine.
+        timeout_s: a machine that is silent for longer counts as gone.
     """
 
     file: Path
@@ -105,7 +105,7 @@ def _host(name: str, keys: Mapping[str, object]) -> Host:
 
 
 def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> list[Problem]:
-    """What the schema cannot say; ``wrong``: pointers to what it has refused."""
+    """Mistakes that the schema cannot express; ``wrong``: pointers to those that it has found."""
     found: list[Problem] = []
     known = {HERE}
     for name, host in root.members("hosts").items():
@@ -141,7 +141,7 @@ def _mistakes(root: Element, project: Project | None, wrong: Sequence[str]) -> l
 
 
 def _control_characters(host: Element) -> Iterator[Problem]:
-    """Texts of a host that no argument of a command can be, or that nobody would see."""
+    """Problems of control characters, which commands refuse or users cannot see."""
     for key in host.value.values():
         for each in key.value if isinstance(key.value, list) else [key]:
             if strange := _CONTROL.search(each.value):
@@ -150,7 +150,7 @@ def _control_characters(host: Element) -> Iterator[Problem]:
 
 
 def _unusable(address: str) -> str:
-    """Why there can be no Docker engine at an address; empty if there can."""
+    """Why an address cannot be that of a Docker engine; empty if it can."""
     try:
         where = urlsplit(address)
         port = where.port

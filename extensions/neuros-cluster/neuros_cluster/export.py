@@ -1,16 +1,16 @@
-"""A project as files for Docker Compose or Kubernetes, which then start its nodes.
+"""Files with which Docker Compose or Kubernetes start the nodes of a project.
 
 For Slurm it is a batch script (:func:`neuros_cluster.slurm.slurm_script`).
 
-The folder that is written holds all that a run needs, but for the images that nodes run in::
+The written folder holds all that a run needs, except the images of the nodes' containers::
 
     compose.yaml or kubernetes.yaml
     nodes.json         the node.json of every node: the configuration
-    Dockerfile         puts the folder image/ on top of the image of a container
-    image/             NeuROS, the project, its messages: what is /neuros in a container
-    runs/              where Compose has the run folders
+    Dockerfile         adds the folder image/ to the image of a container
+    image/             NeuROS, the project, its messages: /neuros in a container
+    runs/              the run folders, with Compose
 
-What a container starts is in :mod:`neuros_cluster.part`.
+Containers start :mod:`neuros_cluster.part`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from neuros_cluster.slurm import slurm_script
 
 ROOT = Path("/neuros")
 FOLDERS = Folders(project=ROOT / "project", workspace=ROOT / "lib/workspace", run=ROOT / "runs")
-"""What a node sees in its container; NeuROS finds its workspace beside itself."""
+"""The folders of a node in its container; NeuROS finds its workspace beside itself."""
 
 NODES_FILE = "nodes.json"
 _LIBRARY, _MESSAGES = ROOT / "lib", ROOT / "messages"
@@ -60,11 +60,11 @@ _RUN = "${RUN:-run}"
 _MOST_PIDS = 4096
 _OF_CONTAINERS = ("peers", "peer_timeout", "host_network", "registry", "volume_claim")
 _OF_SLURM = ("place", "spread")
-_STOP_S = 15  # besides what finalise hooks have: peers say what they have counted
+_STOP_S = 15  # besides the time of finalise hooks: peers exchange their counts
 _PROBE_S = 10
 _LONGEST_LABEL = 63  # of DNS
 _MOST_MACHINES = 65_536  # no cluster has more
-# What the launcher of a node imports, and images of nodes lack: pure Python, in one folder.
+# A dependency of a node's launcher that images of nodes lack: pure Python, in one folder.
 _VENDORED = "tabulate"
 
 _ENTRYPOINT = json.dumps(
@@ -87,10 +87,10 @@ class Part:
     """A node and its container.
 
     Attributes:
-        name: of the service: that of the node, as DNS takes it.
-        base: the image that the node's container stands for.
-        image: what is built on it.
-        command: the arguments of ``neuros part`` behind ``nodes.json``.
+        name: of the service: the node's name in the form of DNS.
+        base: the image of the node's container.
+        image: the image that is built on it.
+        command: the arguments of ``neuros part`` after ``nodes.json``.
         run: its run folder.
     """
 
@@ -103,10 +103,10 @@ class Part:
 
 
 class Export:
-    """A project on its way into a folder.
+    """The files of a project, and their writing into a folder.
 
     Args:
-        messages: the folders for Python's path of the built message packages that it needs.
+        messages: folders on Python's path of the built message packages that the project needs.
     """
 
     def __init__(self, project: Project, messages: Sequence[Path], options: ExportOptions) -> None:
@@ -117,12 +117,12 @@ class Export:
 
     @cached_property
     def name(self) -> str:
-        """The name of the project, as DNS and image names take it."""
+        """The name of the project in the form of DNS and image names."""
         return slug(self.project.name)
 
     @cached_property
     def names(self) -> Mapping[str, str]:
-        """By node, the name of its service."""
+        """The name of each node's service."""
         found: dict[str, str] = {}
         for index, node in enumerate(self.project.nodes):
             name = slug(node.name)
@@ -131,7 +131,7 @@ class Export:
 
     @cached_property
     def files(self) -> list[NodeFile]:
-        """The ``node.json`` of every node, with the paths that it sees."""
+        """The ``node.json`` of every node, with the paths of its container."""
         folders = [(self.project.folder, FOLDERS.project), (WORKSPACE, FOLDERS.workspace)]
 
         def inside(path: Path) -> Path:
@@ -144,7 +144,7 @@ class Export:
         return [replace(file, node=translated(file.node, inside)) for file in files]
 
     def parts(self, host_of: Callable[[str], str], run: str = _RUN) -> list[Part]:
-        """One for each node; ``host_of``: the host name of a service, for its peers."""
+        """The part of each node; ``host_of`` returns the host name of a service."""
         return [self._part(node, host_of, run) for node in self.project.nodes]
 
     def _part(self, node: Node, host_of: Callable[[str], str], run: str) -> Part:
@@ -166,7 +166,7 @@ class Export:
 
     @cached_property
     def _tag(self) -> str:
-        """Changes with what is put into images."""
+        """A digest of the content of images."""
         whole = hashlib.sha256(self._dockerfile.encode())
         for file in files_of(self.folder / "image"):
             whole.update(str(file.relative_to(self.folder)).encode())
@@ -184,17 +184,20 @@ class Export:
         """Write the folder; returns the file for the engine.
 
         Raises:
-            ProjectError: if the project has links or files that may not go into an image.
-            UsageError: if the folder is taken or cannot be written, or a node needs what it
-                cannot have there.
+            ProjectError: the project has links or files that may not go into an image.
+            UsageError: the folder exists or cannot be written, or the engine lacks something that a
+                node needs.
         """
         form = FORMS[self.options.form]
-        self._check(form)
+        self._check_engine(form)
         found, problems = files_to_copy(self.project.folder, self.folder)
         if problems:
             raise _NotExported(problems)
         with _new(self.folder):
-            self._make_folders()
+            for each in ("runs", "image/runs"):
+                (self.folder / each).mkdir(parents=True)
+            # Volumes begin as a copy of the image's folder, and any user must be able to write.
+            (self.folder / "image/runs").chmod(0o1777)
             self._copy(found)
             (self.folder / "Dockerfile").write_text(self._dockerfile, "utf-8")
             (self.folder / ".dockerignore").write_text("runs\n", "utf-8")
@@ -206,7 +209,7 @@ class Export:
             file.write_text(form.head + text, "utf-8")
         return file
 
-    def _check(self, form: Form) -> None:
+    def _check_engine(self, form: Form) -> None:
         if self.options.host_network and form.file == "kubernetes.yaml":
             raise UsageError("--host-network: Kubernetes gives each pod an address of its own")
         if form.file == "kubernetes.yaml":
@@ -221,7 +224,7 @@ class Export:
                     )
 
     def _check_names(self) -> None:
-        """A Service has an RFC 1035 label, the host of an indexed Job one of RFC 1123."""
+        """Check DNS labels: RFC 1035 for a Service, RFC 1123 for the host of an indexed Job."""
         hosts = {f"node '{node}'": f"{self.name}-{name}-0" for node, name in self.names.items()}
         wrong = {what: host for what, host in hosts.items() if len(host) > _LONGEST_LABEL}
         if not self.name[0].isalpha() or len(self.name) > _LONGEST_LABEL:
@@ -236,14 +239,8 @@ class Export:
                 )
             )
 
-    def _make_folders(self) -> None:
-        for each in ("runs", "image/runs"):
-            (self.folder / each).mkdir(parents=True)
-        # Volumes begin as what the image has there, and whoever a container runs as writes to them.
-        (self.folder / "image/runs").chmod(0o1777)
-
     def _copy(self, found: Collection[Path]) -> None:
-        """Fill the image; ``found``: what of the project goes into it, and nothing else does."""
+        """Fill the image; ``found``: the only files of the project that go into it."""
         image = self.folder / "image"
 
         def left_out(folder: str, names: list[str]) -> Iterable[str]:
@@ -271,12 +268,12 @@ class _NotExported(ProjectError):
 
 
 def slug(name: str) -> str:
-    """A name as DNS and image names take it: lower case, digits, and - between them."""
+    """A name in the form of DNS and image names: lower case, digits, and - between them."""
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "project"
 
 
 def export(project: Project, messages: Sequence[Path], options: ExportOptions) -> Path:
-    """Write a project for another engine; returns the file for it.
+    """Write a project for an engine; returns the file for the engine.
 
     Raises:
         ProjectError, UsageError: as :meth:`Export.write` does.
@@ -296,7 +293,7 @@ def export(project: Project, messages: Sequence[Path], options: ExportOptions) -
 
 
 def _check_options(project: Project, options: ExportOptions) -> None:
-    """Refuse what the launchers of its nodes, or their engine, would refuse later."""
+    """Check options that the launchers of nodes, or their engine, would refuse later."""
     if problems := time_problems(project, project.nodes, parse_duration(options.duration)):
         raise _NotExported(problems)
     if options.domain_id is not None:
@@ -308,7 +305,7 @@ def _check_options(project: Project, options: ExportOptions) -> None:
 
 @contextlib.contextmanager
 def _new(folder: Path) -> Iterator[None]:
-    """Make a folder, to be filled; it is as before if that fails. Raises ``UsageError``."""
+    """Make a folder, to be filled inside; undone if that fails. Raises ``UsageError``."""
     try:
         was_there = folder.exists()
         if was_there and (not folder.is_dir() or any(folder.iterdir())):
@@ -330,8 +327,7 @@ def _new(folder: Path) -> Iterator[None]:
 
 
 def _compose(export: Export) -> list[dict[str, Any]]:
-    services = {part.name: _compose_service(export, part) for part in export.parts(str)}
-    return [{"services": services}]
+    return [{"services": {p.name: _compose_service(export, p) for p in export.parts(str)}}]
 
 
 def _compose_service(export: Export, part: Part) -> dict[str, Any]:
@@ -347,7 +343,7 @@ def _compose_service(export: Export, part: Part) -> dict[str, Any]:
         "healthcheck": {"test": ["CMD", *_is_up(part, "$$")], "interval": f"{_PROBE_S}s"},
         "restart": "no",
         "tmpfs": ["/tmp:exec,mode=1777"],
-        # Who exports reads what nodes write, and may remove it.
+        # The exporting user can read and remove the files of nodes.
         "user": f"${{RUN_AS:-{os.getuid()}:{os.getgid()}}}",
         "security_opt": ["no-new-privileges:true"],
         "pids_limit": resources.pids or _MOST_PIDS,
@@ -370,15 +366,15 @@ def _compose_service(export: Export, part: Part) -> dict[str, Any]:
 
 
 def _stop_s(part: Part) -> int:
-    """How long a container may take to end, in seconds; the orchestrator knows no progress."""
+    """Seconds that a container may take to end; orchestrators know no progress."""
     return _STOP_S + math.ceil(part.node.finalise_s)
 
 
 def _is_up(part: Part, dollar: str = "$") -> list[str]:
-    """The command that succeeds while the launcher of a node listens to it, and before it does.
+    """A probe: succeeds while the launcher of a node listens, and before its run folder exists.
 
-    The run folder is an argument of the shell: RUN, which is part of it, may be any text.
-    ``dollar``: how the engine is told one that is not for itself.
+    The run folder is an argument of the shell, since RUN, a part of it, may be any text.
+    ``dollar`` is the engine's way of writing a dollar sign.
     """
     run = f'"{dollar}1"'
     return ["sh", "-c", f"test ! -e {run} || test -S {run}/control.sock", "sh", part.run]
@@ -399,7 +395,7 @@ def _kubernetes(export: Export) -> list[dict[str, Any]]:
             "apiVersion": "v1",
             "kind": "Service",
             "metadata": {"name": export.name, "labels": app},
-            # Each asks for the address of the others before any of them is ready.
+            # Nodes resolve the others' addresses before any of them is ready.
             "spec": {"clusterIP": "None", "publishNotReadyAddresses": True, "selector": app},
         },
         *(_job(export, part, app) for part in export.parts(hosts.__getitem__, run="run")),
@@ -458,7 +454,7 @@ def _job(export: Export, part: Part, app: Mapping[str, str]) -> dict[str, Any]:
         "kind": "Job",
         "metadata": {"name": f"{export.name}-{part.name}", "labels": labels},
         "spec": {
-            "completionMode": "Indexed",  # gives the pod a host name that is known before
+            "completionMode": "Indexed",  # gives the pod a predictable host name
             "completions": 1,
             "parallelism": 1,
             "backoffLimit": 0,
@@ -474,7 +470,7 @@ class Form:
     Attributes:
         documents: makes its YAML documents.
         head: comment at the top of the file.
-        lacks: what nodes may ask for (``Access``), and do not get there.
+        lacks: keys of ``Access`` that its containers cannot have.
     """
 
     file: str
@@ -501,25 +497,25 @@ FORMS: Mapping[str, Form] = {
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # it has no types
-    """Writes texts of several lines as blocks, and repeats what occurs twice."""
+    """Writes texts of several lines as blocks, and no aliases."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
 
 
-def _text(dumper: yaml.SafeDumper, text: str) -> yaml.Node:
-    style = "|" if "\n" in text else None
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style)
-
-
-_Dumper.add_representer(str, _text)
+_Dumper.add_representer(
+    str,
+    lambda dumper, text: dumper.represent_scalar(
+        "tag:yaml.org,2002:str", text, "|" if "\n" in text else None
+    ),
+)
 
 
 def _slurm_script_of(project: Project, options: ExportOptions) -> str:
     """The script for a checked project, with the resources that its nodes declare.
 
     Raises:
-        UsageError: if a node is placed that the project lacks, or on no possible number.
+        UsageError: a node is placed that the project lacks, or on an impossible number.
     """
     names = [node.name for node in project.nodes]
     places = {name: number for number, name in enumerate(names)} if options.spread else {}

@@ -1,22 +1,22 @@
-"""Files of another machine: those that it gets, and those that it writes.
+"""Files of another machine: those sent to it, and those that nodes write there.
 
-It gets *trees*: folders with files, known by their content.
+*Trees* are sent: folders with files, identified by their content.
 
 ::
 
     ~/.cache/neuros/machines/         (or $XDG_CACHE_HOME/neuros/machines)
-        <name>-<key>/                 a tree, whole from its first moment; the key is its content's
+        <name>-<key>/                 a tree, always complete; the key is a digest of its content
         <name>-<key>.json             its files and their digests
-        <name>-<key>.draft/           only while it is being made
-        received/                     what has come for trees; a folder for each agent
+        <name>-<key>.draft/           a tree in the making
+        received/                     received content; a folder for each agent
         runs/                         run folders of agents
 
-Of a tree that is not there, what another one there has is copied, and only the rest is sent. What
-has been changed in a tree there is put right before it is used, and what has come to it is removed.
+A new tree is copied from other trees as far as possible, and only the rest is sent. Changed files
+of a tree are restored before it is used, and added ones are removed.
 
-What nodes write there appears in the run folder of the launcher. Logs and recorded packets do while
-they are written, so that the console and the recorder find them as ever; everything else once the
-nodes have ended. Nodes can put links into both run folders: none is followed.
+The files of nodes there appear in the run folder of the launcher: logs and recorded packets while
+they are written, for the console and the recorder; everything else after the end of the nodes.
+Nodes can put links into both run folders: none is followed.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from neuros.ordinary_files import folder_in, open_log
 from neuros_cluster.messages import Chunk, Tree, TreeFile
 
 RECEIVED, RUNS = "received", "runs"
-"""Folders of agents beside the trees, whose names end with a key."""
+"""Folders of agents, beside the trees; the names of trees end with a key."""
 
 MACHINES = "machines"
-"""The folder in a run folder with what belongs to no node: a folder for each machine."""
+"""The folder in a run folder for files of no node: a folder for each machine."""
 
 _CHUNK_BYTES = 1 << 16
 _LOG = "node.log"
@@ -60,7 +60,7 @@ def scan(name: str, folder: Path) -> Tree:
     """The tree of a folder: without hidden folders, caches of Python, and runs.
 
     Raises:
-        EnvironmentFault: if a file cannot be read.
+        EnvironmentFault: a file cannot be read.
     """
     try:
         files = [_file(path, folder) for path in _files(folder)] if folder.is_dir() else []
@@ -72,7 +72,7 @@ def scan(name: str, folder: Path) -> Tree:
 
 
 def key_of(tree: Tree) -> str:
-    """What a tree is called where it is kept."""
+    """The name of a tree in the cache."""
     text = json.dumps([asdict(file) for file in tree.files]).encode()
     return f"{tree.name}-{hashlib.sha256(text).hexdigest()[:KEY_LENGTH]}"
 
@@ -90,19 +90,19 @@ class TreeStore:
         self._received = cache / RECEIVED / os.urandom(6).hex()
 
     def lacking(self, trees: Sequence[Tree]) -> tuple[str, ...]:
-        """The digests of content that is nowhere here."""
+        """The digests of content that this machine lacks."""
         known = self._known()
         wanted = {file.digest: file for tree in trees for file in tree.files}
         return tuple(digest for digest in wanted if not _find(known, digest))
 
     def receive(self, digest: str, data: bytes) -> None:
-        """The next part of a file. Raises ``OSError``."""
+        """Append a part of a file. Raises ``OSError``."""
         self._received.mkdir(parents=True, exist_ok=True)
         with open(self._received / digest, "ab") as file:
             file.write(data)
 
     def place(self, tree: Tree) -> Path:
-        """The folder with a tree whose content is here. Raises ``OSError``."""
+        """Make a tree whose content is here; returns its folder. Raises ``OSError``."""
         kept = Kept(self._cache / key_of(tree))
         known = self._known()
         with kept.locked():
@@ -122,7 +122,7 @@ class TreeStore:
         return kept.folder
 
     def clean_up(self) -> None:
-        """Remove what was received, and trees that nobody has used for a month."""
+        """Remove received content, and trees that were not used for a month."""
         shutil.rmtree(self._received, ignore_errors=True)
         oldest_s = time.time() - UNUSED_S
         for kept in map(Kept, kept_in(self._cache)):
@@ -132,7 +132,7 @@ class TreeStore:
                     kept.beside(".json").unlink(missing_ok=True)
 
     def _known(self) -> dict[str, list[Path]]:
-        """By digest, the files that should have that content."""
+        """The files that should have a content, by digest."""
         found: dict[str, list[Path]] = {}
         for folder in kept_in(self._cache):
             with contextlib.suppress(OSError, ValueError, TypeError, KeyError):
@@ -158,15 +158,19 @@ def _file(path: Path, folder: Path) -> TreeFile:
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """The ordinary files below a folder; a link to a file is that file."""
-    for parent, folders, names in os.walk(folder, onerror=_raise):
+    """The ordinary files below a folder; a link to a file counts as the file."""
+
+    def fail(error: OSError) -> None:
+        raise error
+
+    for parent, folders, names in os.walk(folder, onerror=fail):
         here = Path(parent)
         folders[:] = [each for each in folders if not _is_left_out(here / each)]
         yield from (here / name for name in names if (here / name).is_file())
 
 
 def _remove_others(folder: Path, wanted: Set[str]) -> None:
-    """Remove files that a tree does not have, and folders empty then. Raises ``OSError``."""
+    """Remove files that a tree does not have, and emptied folders. Raises ``OSError``."""
     for path in [*_files(folder)]:
         if path.relative_to(folder).as_posix() not in wanted:
             path.unlink()
@@ -174,10 +178,6 @@ def _remove_others(folder: Path, wanted: Set[str]) -> None:
                 if parent == folder or any(parent.iterdir()):
                     break
                 parent.rmdir()
-
-
-def _raise(error: OSError) -> None:
-    raise error
 
 
 def _is_left_out(folder: Path) -> bool:
@@ -207,13 +207,13 @@ def _copy(source: Path | None, path: Path, file: TreeFile) -> None:
 
 
 class Follower:
-    """Files of a run folder as they grow.
+    """Reads the files of a run folder as they grow.
 
     Args:
         run: the run folder.
-        nodes: those that have a folder in there.
-        machine: what this machine is called.
-        known: files that the launcher has given, relative to the run folder.
+        nodes: the nodes with a folder in there.
+        machine: the name of this machine.
+        known: files from the launcher, relative to the run folder.
     """
 
     def __init__(
@@ -226,16 +226,16 @@ class Follower:
         self._sent: dict[str, int] = {}
 
     def grown(self, node: str) -> Iterator[Chunk]:
-        """What has come to the logs and to the recorded packets of a node."""
+        """New parts of the log and the recorded packets of a node."""
         folder = self._run / node
         yield from self._news(folder / _LOG)
-        # One that has a successor does not grow any more, and is read to its end before that.
+        # In order: a file with a successor does not grow any more, and is read to its end first.
         with contextlib.suppress(OSError):
             for name in sorted(os.listdir(folder / _SPOOL)):
                 yield from self._news(folder / _SPOOL / name)
 
     def rest(self) -> Iterator[Chunk]:
-        """Everything else that has been written in the run folder."""
+        """New parts of all other files of the run folder."""
         for parent, _, names in os.walk(self._run):
             for name in names:
                 path = Path(parent, name)
@@ -243,12 +243,12 @@ class Follower:
                     yield from self._news(path)
 
     def _news(self, path: Path) -> Iterator[Chunk]:
-        """What a file has beyond what was sent of it; it may have become shorter."""
+        """The unsent parts of a file, which may have become shorter."""
         relative = path.relative_to(self._run)
         name = relative.as_posix()
         if relative.parts[0] not in self._nodes:
             name = f"{MACHINES}/{self._machine}/{name}"
-        if not path.is_file():  # a pipe, say, through which a plugin speaks with its programs
+        if not path.is_file():  # a plugin may make a pipe
             return
         with contextlib.suppress(OSError), open(path, "rb") as file:
             size = os.fstat(file.fileno()).st_size
@@ -259,7 +259,7 @@ class Follower:
             file.seek(sent)
             while data := file.read(_CHUNK_BYTES):
                 offset = self._sent[name]
-                self._sent[name] += len(data)  # who takes it may not ask for more
+                self._sent[name] += len(data)  # before the yield: the caller may stop here
                 yield Chunk(name, offset, data)
 
 
@@ -275,7 +275,7 @@ def write_chunk(run: Path, chunk: Chunk) -> int:
             folder_in(run, *folders, makes=True) as folder,
             open_log(folder / path.name) as file,
         ):
-            file.truncate(chunk.offset)  # what is written goes to the end
+            file.truncate(chunk.offset)  # the file is open for appending
             file.write(chunk.data)
     except (ValueError, OverflowError) as error:  # neither a path nor an offset
         raise OSError(str(error)) from error

@@ -1,8 +1,7 @@
 """Another machine of a run: the launcher's end of the connection to the agent there.
 
-Each machine counts its monotonic time from a moment of its own. So what nodes there report, and
-the times in their packet logs, are moved by the difference, which is known to half of the time that
-a message takes there and back.
+The monotonic clock of each machine has its own origin. So times in reports and packet logs of nodes
+there are shifted by the difference, which is known up to half of the round trip of a message.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ _SSH = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
 _CONNECT_S = 60.0
 _CONTENT_BYTES = 1 << 18
 _MOST_UNSENT_BYTES = 1 << 20
-_LOOK_S = 0.05
+_POLL_S = 0.05
 _COMMAND_NOT_FOUND = 127
 _ENDS_S = 5.0
 _PACKET_LOG = "packets"  # of a node, in its folder
 _EXITS_S = 0.5
 _READ_S = 3.0
-_SAID_LAST_BYTES = 2000
+_LAST_BYTES = 2000
 
 Log = Callable[[str, str], None]
 _Kind = TypeVar("_Kind", bound=Message)
@@ -54,16 +53,16 @@ class Machine:
     """A machine on which an agent runs nodes of a project.
 
     Args:
-        host: how it is reached.
-        timeout_s: after so long without a sign of life it counts as gone.
-        log: takes lines for the user, as ``(severity, text)``; in any thread.
-        command: starts the agent, as its child as far as this machine can tell.
+        host: the way to reach it.
+        timeout_s: a machine that is silent for longer counts as gone.
+        log: receives lines for the user, as ``(severity, text)``; in any thread.
+        command: starts the agent, as a child process of this one.
 
     Attributes:
-        lost: why it cannot be reached any more, empty while it can.
-        clock: how far its clocks are off.
-        folders: those of the project there, once it is placed.
-        fault: what of it could not be kept here, empty if all could.
+        lost: why the connection is lost, empty while it is not.
+        clock: the offset of its clocks.
+        folders: of the project there, once it is placed.
+        fault: the first file that could not be kept here, and why; empty without one.
     """
 
     def __init__(self, host: Host, timeout_s: float, log: Log, command: Sequence[str]) -> None:
@@ -94,18 +93,18 @@ class Machine:
             raise self._failed(f"{command[0]} cannot be started ({error.strerror})") from error
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._errors = _LastWords(self._process)
+        self._errors = _ErrorOutput(self._process)
         self._pump = Pump(
             os.dup(self._process.stdout.fileno()),
             os.dup(self._process.stdin.fileno()),
             agent.FROM_AGENT,
             host.name,
-            self._take,
+            self._handle,
             self._lose,
             connect=self._connect,
             translate=self.clock.data_here,
         )
-        # The pump alone has them, so that the agent sees the end when it closes them.
+        # The agent notices the end when the pump closes its copies.
         self._process.stdin.close()
         self._process.stdout.close()
         self._pump.start()
@@ -116,7 +115,7 @@ class Machine:
         """Wait until the agent is up.
 
         Raises:
-            EnvironmentFault: if it does not come up, or is of another version.
+            EnvironmentFault: the agent does not come up, or has another version.
         """
         ready = self._await(agent.Ready, _CONNECT_S)
         if ready.version != __version__:
@@ -128,10 +127,10 @@ class Machine:
         return ready
 
     def place(self, project: Path) -> int:
-        """Have the project and the workspace there; returns the number of files sent.
+        """Send the project and the workspace; returns the number of sent files.
 
         Raises:
-            EnvironmentFault: if that is impossible.
+            EnvironmentFault: that is impossible.
         """
         trees = {"project": (scan(project.name or "project", project), project)}
         trees["workspace"] = (scan("workspace", WORKSPACE), WORKSPACE)
@@ -149,16 +148,16 @@ class Machine:
         return len(lacking)
 
     def prepare(self, nodes: Sequence[Mapping[str, object]]) -> tuple[Path, ...]:
-        """Have environments and message packages made there; returns the folders of these.
+        """Make environments and message packages there; returns the packages' folders.
 
         Raises:
-            EnvironmentFault: with all that failed.
+            EnvironmentFault: with all failures.
         """
         self._pump.send(agent.Prepare(tuple(nodes)))
         return tuple(map(Path, self._await(agent.Prepared).messages))
 
     def examine(self) -> Sequence[tuple[str, str, str, str]]:
-        """What ``neuros doctor`` finds there. Raises ``EnvironmentFault``."""
+        """The findings of ``neuros doctor`` there. Raises ``EnvironmentFault``."""
         self._pump.send(agent.Examine())
         return self._await(agent.Examined).findings
 
@@ -166,7 +165,7 @@ class Machine:
 
     @property
     def pid(self) -> int:
-        """Of the program that reaches it, which leads a session of its own."""
+        """The process that reaches the machine; it leads a session of its own."""
         return self._process.pid
 
     def begin(self, start: agent.Start, run: Path, control: Callable[[], ControlStream]) -> None:
@@ -175,7 +174,7 @@ class Machine:
         self._pump.send(start)
 
     def await_started(self) -> None:
-        """Until all nodes have been started. Raises ``EnvironmentFault``."""
+        """Wait until all nodes have been started. Raises ``EnvironmentFault``."""
         self._await(agent.Started)
 
     def kill(self, node: str) -> None:
@@ -183,7 +182,7 @@ class Machine:
         self._pump.send(agent.KillNode(node))
 
     def threads_of(self, node: str) -> ProcessThreads:
-        """Where the threads of a node's process stand; waits for the answer for up to 3 s."""
+        """The positions of threads in a node's Python code; waits up to 3 s for the answer."""
         with self._arrived:
             self._threads.pop(node, None)
         if not self.lost:
@@ -199,7 +198,7 @@ class Machine:
         return f"{self.host.name} cannot be reached any more: {self.lost}" if self.lost else None
 
     def finish(self, is_enough: Callable[[], bool]) -> agent.Finished | None:
-        """Have all that the nodes have left sent here; ``None`` if it did not come."""
+        """Copy all files of the nodes to this machine; ``None`` if that failed."""
         if self.lost or self._run is None:
             self.close()
             return None
@@ -212,7 +211,7 @@ class Machine:
             self.close()
 
     def move_times(self, nodes: Sequence[str]) -> None:
-        """Have the packet logs that came from there on the clock of this machine."""
+        """Shift the times of copied packet logs to the clock of this machine."""
         if self._run is None:
             return
         for node in nodes:
@@ -223,7 +222,7 @@ class Machine:
                 self.fault = self.fault or why
 
     def close(self) -> None:
-        """Hang up; the agent ends what is left. Any thread."""
+        """Close the connection; the agent ends what is left. Callable from any thread."""
         with self._arrived:
             self._is_closed = True
             self._arrived.notify_all()
@@ -239,13 +238,21 @@ class Machine:
 
     # ------------------------------------------------------------------ inside
 
-    def _take(self, message: Message) -> None:
-        """A message of the agent; in the thread of the pump."""
+    def _handle(self, message: Message) -> None:
+        """Handle a message of the agent, in the thread of the pump."""
         match message:
             case agent.Pong():
-                self.clock.take(message, time.monotonic(), time.time())
+                self.clock.add(message, time.monotonic(), time.time())
             case agent.Chunk():
-                self._keep(message)
+                if self._run is None:
+                    return
+                try:
+                    size = write_chunk(self._run, message)
+                except OSError as error:
+                    size = len(message.data)
+                    what = f"{message.path} of {self.host.name}"
+                    self.fault = self.fault or f"{what} cannot be written: {reason_of(error)}"
+                self._pump.send(agent.Took(size))
             case agent.Remark(severity, text):
                 self._log(severity, f"{self.host.name}: {text}")
             case agent.NodeEnded(node, how):
@@ -256,29 +263,17 @@ class Machine:
                     self._arrived.notify_all()
             case _:
                 if isinstance(message, agent.Finished):
-                    self._pump.end()  # that it hangs up now is no fault
+                    self._pump.end()  # the end of the agent is no fault from now on
                 with self._arrived:
                     self._answers.append(message)
                     self._arrived.notify_all()
-
-    def _keep(self, chunk: agent.Chunk) -> None:
-        if self._run is None:
-            return
-        try:
-            size = write_chunk(self._run, chunk)
-        except OSError as error:
-            size = len(chunk.data)
-            if not self.fault:
-                what = f"{chunk.path} of {self.host.name}"
-                self.fault = f"{what} cannot be written: {reason_of(error)}"
-        self._pump.send(agent.Took(size))
 
     def _lose(self, reason: str) -> None:
         code = None
         with contextlib.suppress(subprocess.TimeoutExpired):
             code = self._process.wait(_EXITS_S)
         if code is None:
-            self._process.kill()  # it would go on trying for minutes
+            self._process.kill()  # ssh would retry for minutes
         self._errors.join(_EXITS_S)
         said = self._errors.last
         if code == _COMMAND_NOT_FOUND and not self.host.docker:
@@ -301,14 +296,14 @@ class Machine:
         limit_s: float | None = None,
         is_enough: Callable[[], bool] = lambda: False,
     ) -> _Kind:
-        """The next answer, which must be of this kind. Raises ``EnvironmentFault``."""
+        """Wait for the next answer, of this kind. Raises ``EnvironmentFault``."""
         end_s = None if limit_s is None else time.monotonic() + limit_s
         with self._arrived:
             while not self._answers:
                 self._require_open()
                 if is_enough() or (end_s is not None and time.monotonic() > end_s):
                     raise self._failed("it did not answer in time")
-                self._arrived.wait(_LOOK_S)
+                self._arrived.wait(_POLL_S)
             answer = self._answers.pop(0)
         if isinstance(answer, agent.Refused):
             raise self._failed(answer.text)
@@ -329,8 +324,8 @@ class Machine:
                 while True:
                     following = file.read(_CONTENT_BYTES)
                     while self._pump.unsent_bytes > _MOST_UNSENT_BYTES:
-                        self._require_open()  # else, after Ctrl+C, nobody writes it any more
-                        time.sleep(_LOOK_S)
+                        self._require_open()  # after Ctrl+C the pump has stopped writing
+                        time.sleep(_POLL_S)
                     self._require_open()
                     self._pump.send(agent.Content(digest, data, not following))
                     if not following:
@@ -341,7 +336,7 @@ class Machine:
 
 
 def agent_command(host: Host) -> list[str]:
-    """The command that starts the agent on a machine, as its child as far as this one can tell."""
+    """The command that starts the agent of a machine, as a child process of this one."""
     if host.through:
         return [*host.through, os.path.expanduser(host.neuros), "agent"]
     neuros = host.neuros
@@ -355,8 +350,8 @@ def ssh_command(host: Host) -> list[str]:
     return ["ssh", *_SSH, *host.ssh_options]
 
 
-class _LastWords(threading.Thread):
-    """Reads what a program writes to its standard error, and remembers the end of it."""
+class _ErrorOutput(threading.Thread):
+    """Reads the standard error of a program, and keeps its end."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         super().__init__(name="neuros-errors", daemon=True)
@@ -368,19 +363,19 @@ class _LastWords(threading.Thread):
         assert self._process.stderr is not None
         with self._process.stderr as stream:
             while data := os.read(stream.fileno(), 1 << 12):
-                self._said = (self._said + data)[-_SAID_LAST_BYTES:]
+                self._said = (self._said + data)[-_LAST_BYTES:]
 
     @property
     def last(self) -> str:
-        """The last line, which is why it has ended."""
+        """The last line: the reason of the program's end."""
         lines = self._said.decode("utf-8", "replace").strip().splitlines()
         return lines[-1].strip() if lines else ""
 
 
 _MOST_DRIFT = 1e-4
-"""Seconds per second by which clocks drift apart: crystals are within 1e-4 of what they show."""
+"""Drift of two clocks in seconds per second: crystals are exact to 1e-4."""
 
-# Columns of times in the files of a packet log, of so many columns each.
+# Files of a packet log: width of a row, and the columns with times.
 _TIMES: Mapping[str, tuple[int, tuple[int, ...]]] = {
     "sent_ns": (1, (0,)),
     "taken_ns": (1, (0,)),
@@ -391,16 +386,16 @@ _TIMES: Mapping[str, tuple[int, tuple[int, ...]]] = {
 
 @dataclass
 class ClockOffset:
-    """How far the clocks of another machine are ahead of this one's, in seconds.
+    """Difference of another machine's clocks from this one's, in seconds; positive: ahead.
 
-    Clocks of two machines drift apart. So an answer counts for less the older it is, as in NTP
-    (RFC 5905, dispersion): its error is at most half of its round trip, and what the clocks may
-    have drifted since. The one of the smallest error counts.
+    Clocks drift apart, so the error of an answer grows with its age, as in NTP (RFC 5905,
+    dispersion): half of its round trip, plus the possible drift since. The answer with the smallest
+    error counts.
 
     Attributes:
-        round_trip_s: of the answer that it is known from.
-        monotonic_s, unix_s: the difference of the monotonic clocks, and of those that show the time
-            of day, at that answer.
+        round_trip_s: of that answer.
+        monotonic_s, unix_s: the differences of the monotonic clocks, and of the times of day, at
+            that answer.
     """
 
     round_trip_s: float = float("inf")
@@ -409,37 +404,35 @@ class ClockOffset:
     _known_at_s: float = 0.0
     _course: list[tuple[float, float, float]] = field(default_factory=list)
 
-    def take(self, pong: agent.Pong, now_s: float, now_unix_s: float) -> None:
-        """An answer that arrives now, by the clocks of this machine."""
+    def add(self, pong: agent.Pong, now_s: float, now_unix_s: float) -> None:
+        """Add an answer that arrives now, by the clocks of this machine."""
         round_trip_s = now_s - pong.sent_s
         drift_s = _MOST_DRIFT * (now_s - self._known_at_s)
         if round_trip_s / 2 < self.round_trip_s / 2 + drift_s:
             self.round_trip_s, self._known_at_s = round_trip_s, now_s
             ahead_s = pong.monotonic_s - (now_s - round_trip_s / 2)
-            # Containers of one machine have one clock.
+            # Containers of one machine share a clock.
             self.monotonic_s = ahead_s if abs(ahead_s) > round_trip_s else 0.0
             self.unix_s = pong.unix_s - (now_unix_s - round_trip_s / 2)
-            self._note(pong.monotonic_s, round_trip_s / 2)
-
-    def _note(self, at_s: float, error_s: float) -> None:
-        """Keep what is known of this moment, on the clock there, for packet logs."""
-        while self._course:
-            earlier_s, _, earlier_error_s = self._course[-1]
-            if earlier_error_s <= error_s + _MOST_DRIFT * (at_s - earlier_s):
-                break
-            self._course.pop()  # now it is better known, for that moment too
-        self._course.append((at_s, self.monotonic_s, error_s))
+            # Drop earlier answers that this one beats even at their own moments.
+            at_s, error_s = pong.monotonic_s, round_trip_s / 2
+            while self._course:
+                earlier_s, _, earlier_error_s = self._course[-1]
+                if earlier_error_s <= error_s + _MOST_DRIFT * (at_s - earlier_s):
+                    break
+                self._course.pop()
+            self._course.append((at_s, self.monotonic_s, error_s))
 
     @property
     def is_known(self) -> bool:
-        """Whether there was an answer."""
+        """Whether an answer has arrived."""
         return self.round_trip_s < float("inf")
 
     def data_here(self, data: bytes) -> bytes:
         """The bytes of a message of a node there, with its times on the clock of this machine."""
         try:
             return to_bytes(self.message_here(decode(data, decoder_of(tuple(FROM_NODES)), "")))
-        except ControlError:  # the supervisor says what is wrong with it
+        except ControlError:  # the supervisor reports the mistake
             return data
 
     def message_here(self, message: Message) -> Message:
@@ -465,7 +458,7 @@ class ClockOffset:
                     for key, (position, at_ns) in message.counters.taken_ns.items()
                 },
             )
-            # Of sampled fields, each row begins with its time.
+            # The first value of each row of a sample is its time.
             samples = {
                 port: {**each, "values": [[row[0] - shift_s, *row[1:]] for row in each["values"]]}
                 if each.get("values")
@@ -476,14 +469,14 @@ class ClockOffset:
         return message
 
     def log_here(self, folder: Path) -> None:
-        """Move the times in the packet log of a node there. Raises ``OSError``."""
+        """Shift the times in the packet log of a node there. Raises ``OSError``."""
         import numpy as np
 
         if not self._course:
             return
         at_s, ahead_s, _ = zip(*self._course, strict=True)
         for file in sorted(folder.glob("*")):
-            # As 3.taken_ns, or 3.taken_ns.524288 with what came later.
+            # Names are as 3.taken_ns, or 3.taken_ns.524288 for a later part.
             what = next((part for part in file.name.split(".") if part in _TIMES), "")
             width, columns = _TIMES.get(what, (1, ()))
             if columns:
@@ -491,6 +484,6 @@ class ClockOffset:
                 entries = np.frombuffer(data[: len(data) // 8 * 8], np.int64).copy()
                 for column in columns:
                     times = entries[column::width]
-                    # On a straight line between two answers.
+                    # Interpolated between two answers.
                     times -= np.rint(1e9 * np.interp(1e-9 * times, at_s, ahead_s)).astype(np.int64)
                 write_whole(file, entries.tobytes())

@@ -1,8 +1,8 @@
 """Messages between a launcher and its agents: the programs that run its nodes on other machines.
 
-They travel as those of the control channel do, over the standard input and output of the program
-that reaches the machine (``ssh``). Control connections of the nodes there pass through: each has a
-number, and each of its messages is the data of a :class:`Said`.
+Messages have the form of the control channel's, and travel over the standard input and output of
+the program that reaches the machine (``ssh``). They also carry the control connections of the nodes
+there: each has a number, and each of its messages is the data of a :class:`Said`.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from neuros.stacks import ProcessThreads
 
 
 class Ping(Message):
-    """A sign of life, to be answered at once; ``sent_s`` is on the sender's monotonic clock."""
+    """A sign of life, answered at once; ``sent_s`` is on the sender's monotonic clock."""
 
     sent_s: float
 
 
 class Pong(Message):
-    """The answer, with the clocks of who answers: monotonic, and Unix time, in seconds."""
+    """The answer, with the answering side's monotonic and Unix time, in seconds."""
 
     sent_s: float
     monotonic_s: float
@@ -71,7 +71,7 @@ class Tree(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Place(Message):
-    """Have these folders there; the last sign of life may be ``timeout_s`` seconds old."""
+    """Make these trees; a launcher that is silent for ``timeout_s`` seconds is gone."""
 
     project: Tree
     workspace: Tree
@@ -79,7 +79,7 @@ class Place(Message):
 
 
 class Content(Message):
-    """The next part of a file that is lacking."""
+    """The next part of a lacking file."""
 
     digest: str
     data: bytes
@@ -87,7 +87,7 @@ class Content(Message):
 
 
 class Prepare(Message):
-    """Get ready for nodes: their ``node.json``, with the paths of the agent's machine."""
+    """Prepare nodes, given their ``node.json`` with the paths of the agent's machine."""
 
     nodes: tuple[Mapping[str, Any], ...]
 
@@ -97,13 +97,13 @@ class Start(Message):
 
     Attributes:
         run: its id; ``project``: its name.
-        machine: what the agent's machine is called.
+        machine: the name of the agent's machine.
         nodes: their ``node.json``.
         files: texts for the run folder, by name.
         environment: of each node.
         options: of the node program.
         cores: by node.
-        monitors_load: whether to write what they take of the machine.
+        monitors_load: whether to record the system load.
     """
 
     run: str
@@ -130,17 +130,17 @@ class ReadThreads(Message):
 
 
 class Took(Message):
-    """So many bytes of :class:`Chunk` have been written."""
+    """This number of bytes of :class:`Chunk` has been written."""
 
     size: int
 
 
 class Examine(Message):
-    """Look at the machine, as ``neuros doctor`` does."""
+    """Examine the machine, as ``neuros doctor`` does."""
 
 
 class Finish(Message):
-    """All nodes have ended: send what they have left, remove it, and end."""
+    """All nodes have ended: send their files, remove them, and end."""
 
 
 # ---------------------------------------------------------------------- from the agent
@@ -163,7 +163,7 @@ class Ready(Message):
 
 
 class Lacking(Message):
-    """The content that has to be sent, by digest; perhaps none."""
+    """The content to send, by digest; may be empty."""
 
     digests: tuple[str, ...]
 
@@ -194,7 +194,7 @@ class Started(Message):
 
 
 class Refused(Message):
-    """What was asked for last cannot be done, in sentences for the user."""
+    """The last request cannot be fulfilled; the reason, for the user."""
 
     text: str
 
@@ -214,7 +214,7 @@ class ThreadsRead(Message):
 
 
 class Chunk(Message):
-    """Bytes of a file of the run folder, at the offset at which it is to end before."""
+    """Bytes of a file of the run folder; the file is cut off at ``offset`` before."""
 
     path: str
     offset: int
@@ -222,13 +222,13 @@ class Chunk(Message):
 
 
 class Examined(Message):
-    """What was found: state, subject, text and remedy of each finding."""
+    """State, subject, text and remedy of each finding."""
 
     findings: tuple[tuple[str, str, str, str], ...]
 
 
 class Finished(Message):
-    """All has been sent; ``load``: the summary of the system load there, ``None`` without one."""
+    """All files have been sent; ``load``: the summary of the system load, ``None`` without one."""
 
     load: Mapping[str, Any] | None = None
     problems: tuple[str, ...] = ()

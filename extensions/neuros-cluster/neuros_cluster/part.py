@@ -1,8 +1,8 @@
 """One node of an exported project, where each container starts its own node.
 
-No launcher starts all nodes of an exported project: each container has a launcher for one node, and
-these launchers are peers (:mod:`neuros.launcher.peers`). The project has been checked when it was
-exported, so that a part needs its ``node.json`` files only, which lie in one file for all nodes.
+Each container has a launcher for one node, and these launchers are peers
+(:mod:`neuros.launcher.peers`). The export has checked the project, so a part only needs the
+``node.json`` files, which one file holds for all nodes.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ _CODES_OF_SIGNALS = {2: 130, 15: 143, 1: 143}
 
 
 def parts_to_json(project: Project, files: Sequence[NodeFile]) -> dict[str, Any]:
-    """The content of ``nodes.json``: the ``node.json`` of every node, and what is of none.
+    """The content of ``nodes.json``: the ``node.json`` of every node, and data of the project.
 
     Args:
-        files: with the paths that nodes see in their containers.
+        files: with the paths of the nodes' containers.
     """
     return {
         "project": project.name,
@@ -64,7 +64,7 @@ def read_parts(file: Path) -> Project:
     """The project that was exported to a file.
 
     Raises:
-        UsageError: if it is none.
+        UsageError: the file is not a project's.
     """
     try:
         return parts_from_json(json.loads(file.read_text("utf-8")))
@@ -80,14 +80,14 @@ def part_plan(project: Project, network: Network, request: Request) -> Plan:
     """The plan of a launcher that starts one node of the project, as a process of its container.
 
     Raises:
-        UsageError: if there is no such node.
-        EnvironmentFault: if it cannot be run here.
+        UsageError: there is no such node.
+        EnvironmentFault: the node cannot run here.
     """
     known = {node.name for node in project.nodes}
     for name in request.nodes:
         if name not in known:
             raise UsageError(f"no such node: {name}; the project has {', '.join(sorted(known))}")
-    # The engine, or Kubernetes, keeps the limits of nodes here: there is no notice that none does.
+    # The engine or Kubernetes enforces limits, so there is no notice that the back end does not.
     chosen = Chosen(PROCESS, PROCESS.prepare(project, [], {}))
     plan = Plan(project, tuple(request.nodes), chosen, request, network=network)
     check_machine(plan, {})
@@ -95,17 +95,17 @@ def part_plan(project: Project, network: Network, request: Request) -> Plan:
 
 
 def reach_peers(peers: str | None, timeout_s: float | None, signals: Sequence[int]) -> Network:
-    """The network with these peers, once all their names are known.
+    """The network with these peers, once all their names can be resolved.
 
-    A container gets its name when it starts, and each may be the first.
+    A container gets its name when it starts, and each may be the first to start.
 
     Args:
-        timeout_s: seconds; ``None``: names that are not known at once are never waited for.
+        timeout_s: seconds; ``None``: do not wait for names.
         signals: a signal that arrives here ends the wait.
 
     Raises:
-        UsageError: if one can be no name.
-        EnvironmentFault: if one is not known in time.
+        UsageError: a name is impossible.
+        EnvironmentFault: a name cannot be resolved in time.
     """
     deadline_s = time.monotonic() + (timeout_s or 0.0)
     while True:

@@ -1,7 +1,7 @@
 """Pump: carries messages and control connections between a launcher and an agent.
 
-One thread at each end, which never waits for anything but all of its descriptors at once: so signs
-of life come and are heard whatever else a process does. Whatever arrives is a sign of life.
+One thread at each end waits for all of its descriptors at once, and for nothing else: so signs of
+life are sent and received whatever the process does. Any data is a sign of life.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from neuros_cluster.messages import Closed, Opened, Ping, Pong, Said
 BEAT_S = 1.0
 _CLOSED = "the connection was closed"
 _READ_BYTES = 1 << 16
-_MOST_UNTOLD_BYTES = 1 << 20
-"""A control connection whose other end takes nothing is hung up on from here on."""
+_MOST_UNSENT_BYTES = 1 << 20
+"""A control connection is closed when its other end leaves this many bytes unread."""
 
 
 class Pump(threading.Thread):
     """One end of the connection between a launcher and an agent.
 
     Args:
-        read_from, write_to: descriptors, which it closes in the end.
-        accepted: the messages that may come.
-        peer: who is at the other end, for error messages.
-        take: is called with each message that is not the pump's own; in its thread.
-        lose: is called once when nobody is there any more, with the reason.
-        connect: makes the other end of a control connection that was opened over there.
-        translate: is applied to what is said on one over there.
+        read_from, write_to: descriptors, which the pump closes in the end.
+        accepted: the messages that may arrive.
+        peer: the other end, for error messages.
+        handle: called with each message that is not the pump's own; in its thread.
+        lose: called once with the reason when the other end is gone.
+        connect: makes this end of a control connection that was opened over there.
+        translate: applied to the text of control connections from over there.
 
     Attributes:
-        timeout_s: after so long without a sign of life the other end counts as gone; ``None``: not.
-        heard_s: when the last one came, on the monotonic clock.
+        timeout_s: an end that is silent for longer counts as gone; ``None``: no limit.
+        received_s: the last sign of life, on the monotonic clock.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Pump(threading.Thread):
         write_to: int,
         accepted: Sequence[type[Message]],
         peer: str,
-        take: Callable[[Message], None],
+        handle: Callable[[Message], None],
         lose: Callable[[str], None],
         *,
         connect: Callable[[], ControlStream] | None = None,
@@ -59,10 +59,10 @@ class Pump(threading.Thread):
     ) -> None:
         super().__init__(name=f"neuros-{peer}", daemon=True)
         self.timeout_s: float | None = None
-        self.heard_s = time.monotonic()
+        self.received_s = time.monotonic()
         self._read_from, self._write_to = read_from, write_to
         self._decoder = decoder_of(tuple(accepted))
-        self._peer, self._take, self._lose = peer, take, lose
+        self._peer, self._handle_other, self._lose = peer, handle, lose
         self._connect, self._translate = connect, translate
         self._lock = threading.Lock()
         self._unsent = bytearray()
@@ -85,35 +85,35 @@ class Pump(threading.Thread):
     # ------------------------------------------------------------------ called by others
 
     def send(self, message: Message) -> None:
-        """Send it, now or later. Any thread."""
+        """Queue a message to be sent. Callable from any thread."""
         with self._lock:
             self._unsent += encode(message)
         self._wake()
 
     def send_last(self, message: Message) -> None:
-        """Send it after all that has been said on control connections by now. Any thread."""
+        """Send a message after all present data of control connections. Any thread."""
         self._last.append(message)
         self._wake()
 
     @property
     def unsent_bytes(self) -> int:
-        """What has not been written yet."""
+        """Number of bytes that have not been written yet."""
         return len(self._unsent)
 
     def listen(self, listener: ControlListener) -> None:
-        """Accept control connections here, from now on. Any thread."""
+        """Accept control connections from now on. Callable from any thread."""
         self._listener = listener
         self._wake()
 
     def end(self) -> None:
-        """Write what there is to be sent, and hang up. Any thread."""
+        """Write all queued messages, and end. Callable from any thread."""
         self._is_ending = True
         self._wake()
 
     # ------------------------------------------------------------------ the thread
 
     def run(self) -> None:
-        """Until :meth:`end`, or nobody is there any more."""
+        """Run until :meth:`end`, or until the other end is gone."""
         reason = ""
         next_s = 0.0
         try:
@@ -123,11 +123,11 @@ class Pump(threading.Thread):
                     next_s = now_s + BEAT_S
                     self.send(Ping(now_s))
                 reason = self._turn(max(0.0, next_s - time.monotonic()))
-        except Exception as error:  # else nobody would know that nothing is carried any more
+        except Exception as error:  # nothing else would report that the pump has stopped
             reason = f"{type(error).__name__}: {error}"
         finally:
             if reason and not self._is_ending:
-                self._lose(reason)  # before anybody sees that control connections have ended
+                self._lose(reason)  # before control connections are seen to end
             for link in tuple(self._links):
                 self._hang_up(link)
             self._selector.close()
@@ -138,7 +138,7 @@ class Pump(threading.Thread):
                     os.close(descriptor)
 
     def _turn(self, wait_s: float) -> str:
-        """One look at everything; returns why the other end is gone, empty while it is there."""
+        """Handle what is ready; returns why the other end is gone, empty while it is there."""
         self._watch()
         ready = {key.fd for key, _ in self._selector.select(wait_s)}
         if self._woken.fileno() in ready:
@@ -155,14 +155,14 @@ class Pump(threading.Thread):
         self._send_last()
         if self._write_to in ready and (reason := self._write()):
             return reason
-        silent_s = time.monotonic() - self.heard_s
-        # What came while this process could not run has been read by now.
+        silent_s = time.monotonic() - self.received_s
+        # Not ready: all data that arrived while this process could not run has been read.
         if self.timeout_s is not None and not ready and silent_s > self.timeout_s:
             return f"nothing was heard of {self._peer} for {self.timeout_s:g} s"
         return ""
 
     def _watch(self) -> None:
-        """Look at what there is to be written and accepted."""
+        """Register what is to be written and accepted."""
         wanted = {self._write_to} if self._unsent else set()
         for descriptor in self._writes - wanted:
             self._selector.unregister(descriptor)
@@ -172,7 +172,7 @@ class Pump(threading.Thread):
         if self._listener is not None and self._listener not in self._selector.get_map():
             self._selector.register(self._listener, selectors.EVENT_READ)
         for number, link in tuple(self._links.items()):
-            if not link.flush() or len(link.unsent) > _MOST_UNTOLD_BYTES:
+            if not link.flush() or len(link.unsent) > _MOST_UNSENT_BYTES:
                 self._part(number)
 
     def _read(self) -> str:
@@ -184,16 +184,16 @@ class Pump(threading.Thread):
             return str(error.strerror)
         if not data:
             return _CLOSED
-        self.heard_s = time.monotonic()
+        self.received_s = time.monotonic()
         self._received += data
         try:
             for each in remove_messages(self._received, self._peer):
-                self._obey(decode(each, self._decoder, self._peer))
+                self._handle(decode(each, self._decoder, self._peer))
         except ControlError as error:
             return str(error)
         return ""
 
-    def _obey(self, message: Message) -> None:
+    def _handle(self, message: Message) -> None:
         match message:
             case Ping(sent_s):
                 self.send(Pong(sent_s, time.monotonic(), time.time()))
@@ -207,8 +207,8 @@ class Pump(threading.Thread):
                 self._hang_up(number)
             case _:
                 for link in self._links.values():
-                    link.flush()  # what came before is heard before
-                self._take(message)
+                    link.flush()  # keeps the order of arrival
+                self._handle_other(message)
 
     def _write(self) -> str:
         with self._lock:
@@ -216,7 +216,7 @@ class Pump(threading.Thread):
                 written = os.write(self._write_to, self._unsent[:_READ_BYTES])
             except BlockingIOError:
                 return ""
-            except BrokenPipeError:  # it has ended; what it has said before is still to be read
+            except BrokenPipeError:  # the other end is gone; its last data is still to be read
                 self._unsent.clear()
                 return ""
             except OSError as error:
@@ -230,7 +230,7 @@ class Pump(threading.Thread):
         count = len(self._last)
         if not count:
             return
-        self._accept()  # who waits has said something, too
+        self._accept()  # waiting connections have data, too
         for number, link in tuple(self._links.items()):
             while number in self._links and self._relay(number, link):
                 pass
@@ -247,7 +247,7 @@ class Pump(threading.Thread):
         assert self._connect is not None
         try:
             self._add(number, self._connect())
-        except OSError:  # the supervisor listens no more
+        except OSError:  # the supervisor does not listen any more
             self.send(Closed(number))
 
     def _add(self, number: int, stream: ControlStream) -> None:
@@ -256,7 +256,7 @@ class Pump(threading.Thread):
         self._selector.register(link, selectors.EVENT_READ)
 
     def _relay(self, number: int, link: ControlLink) -> bool:
-        """Pass on what was said; returns whether there may be more right now."""
+        """Send the data of a connection; returns whether there may be more right now."""
         try:
             found = link.read()
         except BlockingIOError:

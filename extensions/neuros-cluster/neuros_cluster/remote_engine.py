@@ -1,10 +1,10 @@
 """Nodes in containers of an engine on another machine, which needs nothing but that engine.
 
-Each node has a container, and in it an agent (:mod:`neuros_cluster.agent`), with which the launcher
-talks over the standard input and output of ``docker start --attach``. An engine behind ``ssh`` is
-reached through a tunnel to its socket. Where it lacks the image of a node, and the engine of this
-machine has it, the image is copied. NeuROS itself and built message packages are put into each
-container; project files that have come once are kept in a volume of the engine.
+Each node has a container with an agent (:mod:`neuros_cluster.agent`), to which the launcher talks
+over the standard input and output of ``docker start --attach``. An engine behind ``ssh`` is reached
+through a tunnel to its socket. An image that the engine lacks is copied from the engine of this
+machine. NeuROS and built message packages are copied into each container; received project files
+are kept in a volume of the engine.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ AGENT_LABEL = "neuros.agent"
 """The label of every container with an agent."""
 
 VOLUME = "neuros_agent"
-"""The volume in which agents keep files that have come."""
+"""The volume with the files that agents have received."""
 
 _CACHE = ROOT / "cache"
 _USER = 1000  # as in the images of NeuROS
 _SOCKET = "/var/run/docker.sock"
 _FORWARDING = ("-o", "ExitOnForwardFailure=yes")
 _CONNECT_S = 30.0
-_LOOK_S = 0.02
+_POLL_S = 0.02
 _NEVER_STARTED_S = 60.0
 _REMOVAL_S, _GONE_S = 2.0, 0.1
 
@@ -62,16 +62,16 @@ Log = Callable[[str, str], None]
 
 
 class RemoteEngine:
-    """The engine of a host; :meth:`close` it.
+    """The engine of a host; must be closed.
 
     Args:
-        ssh: the command ``ssh`` with the options that NeuROS gives it.
+        ssh: the command ``ssh`` with NeuROS's options.
 
     Attributes:
-        reached_at: the address of the machine, as far as the way to it tells; else empty.
+        reached_at: the address of the machine, if the way to it tells; else empty.
 
     Raises:
-        EnvironmentFault: if it cannot be reached.
+        EnvironmentFault: the engine cannot be reached.
     """
 
     def __init__(self, host: Host, ssh: Sequence[str]) -> None:
@@ -86,34 +86,34 @@ class RemoteEngine:
             found = {**os.environ, "DOCKER_HOST": self._address}
             self._engine = connect(found, timeout_s=None)
             self._held.callback(self._engine.close)
-            if where.scheme == "unix":  # of a rootless engine it is not the usual one
+            if where.scheme == "unix":  # a rootless engine has another socket than the usual one
                 self._address = f"unix://{engine_socket(self._engine)}"
             with engine_faults("Docker"):
                 self._is_rootless = Abilities.of(self._engine.info()).is_rootless
         except BaseException as error:
             self.close()
             if isinstance(error, EnvironmentFault):
-                why = str(error).removesuffix(f", {OR_WITHOUT}")  # which it cannot do without
+                why = str(error).removesuffix(f", {OR_WITHOUT}")  # a remote node needs the engine
                 raise EnvironmentFault(f"{host}: {why}") from error
             raise
 
     def container(self, node: Node, project: Path, log: Log) -> AgentContainer:
-        """Make the container of a node, and copy its image if need be.
+        """Make the container of a node, and copy its image if necessary.
 
         Raises:
-            EnvironmentFault: if it has no image, or the engine refuses.
+            EnvironmentFault: there is no image, or the engine refuses.
         """
         try:
             image = self._image(node.container, project, log)
             with engine_faults(f"the container of node '{node.name}'"):
-                # Those whose launcher was killed between two requests are never started.
+                # Containers whose launcher was killed before their start are never started.
                 wanted = {"label": AGENT_LABEL, "status": "created"}
                 for container in self._engine.containers.list(
                     all=True, filters=wanted, ignore_removed=True
                 ):
                     made = datetime.fromisoformat(f"{container.attrs['Created'][:19]}+00:00")
                     if (datetime.now(timezone.utc) - made).total_seconds() > _NEVER_STARTED_S:
-                        with contextlib.suppress(NotFound):  # another launcher clears up, too
+                        with contextlib.suppress(NotFound):  # another launcher may remove it, too
                             container.remove(force=True)
                 return AgentContainer(
                     self._engine, self._address, node, image, 0 if self._is_rootless else _USER
@@ -122,18 +122,18 @@ class RemoteEngine:
             raise EnvironmentFault(f"{self.host}: {fault}") from fault
 
     def close(self) -> None:
-        """Leave it. Any thread; a second call has no effect."""
+        """Close the connection. Callable from any thread; idempotent."""
         self._held.close()
 
     def _tunnelled(self, ssh: Sequence[str]) -> str:
-        """The address of a socket here that leads to the engine's there."""
+        """Open a tunnel to the engine's socket; returns the address of its end here."""
         where = urlsplit(self.host.docker)
-        folder = Path(tempfile.mkdtemp(prefix="neuros-docker-"))  # short, as names of sockets are
+        folder = Path(tempfile.mkdtemp(prefix="neuros-docker-"))  # names of sockets must be short
         self._held.callback(shutil.rmtree, folder, ignore_errors=True)
         socket, errors = folder / "socket", folder / "errors"
         destination = f"ssh://{where.netloc}"
         forward = f"{socket}:{where.path.rstrip('/') or _SOCKET}"
-        # It ends with its standard input, and so with this process, come what may.
+        # The remote command ends with its standard input, and so with this process in any case.
         remote = "echo ${SSH_CONNECTION:-}; exec cat >/dev/null"
         with open(errors, "w") as log:
             try:
@@ -154,7 +154,7 @@ class RemoteEngine:
         said = tunnel.stdout.readline()
         end_s = time.monotonic() + _CONNECT_S
         while said and not socket.is_socket() and time.monotonic() < end_s:
-            time.sleep(_LOOK_S)
+            time.sleep(_POLL_S)
         if not said or not socket.is_socket():
             last = (errors.read_text().strip().splitlines() or ["it does not say why"])[-1].strip()
             raise EnvironmentFault(f"ssh has no connection ({last})")
@@ -162,7 +162,7 @@ class RemoteEngine:
         return f"unix://{socket}"
 
     def _image(self, container: str, project: Path, log: Log) -> Image:
-        """The image of a container there; one of this machine is sent if it is the better one."""
+        """The image of a container there; a better one of this machine is sent."""
         there: Image | None = None
         try:
             there = image_for(container, project, self._engine)
@@ -188,10 +188,10 @@ class RemoteEngine:
 
 
 class AgentContainer:
-    """A container that was made and is not started yet: :attr:`command` does that.
+    """A container that :attr:`command` starts.
 
     Attributes:
-        command: starts it, with its standard streams; it is removed when it has ended.
+        command: starts it, with its standard streams; it is removed at its end.
         description: its image and engine, ready for JSON.
     """
 
@@ -233,10 +233,10 @@ class AgentContainer:
         self.description: Mapping[str, str] = {"image": image.name, "id": image.id}
 
     def put_messages(self, paths: Iterable[Path]) -> tuple[Path, ...]:
-        """Have built message packages there; returns where Python finds them.
+        """Copy built message packages into it; returns their folders on Python's path.
 
         Args:
-            paths: where Python finds them here, ``<package>-<key>/python``.
+            paths: their folders on Python's path here, ``<package>-<key>/python``.
         """
         found = {MESSAGES / path.parent.name: path.parent for path in paths}
         if found:
@@ -245,10 +245,7 @@ class AgentContainer:
         return tuple(folder / "python" for folder in found)
 
     def close(self) -> None:
-        """Remove it, if it is still there.
-
-        Where its engine does not answer any more, it ends by itself with its agent.
-        """
+        """Remove the container. If its engine does not answer, it ends with its agent."""
         api = self._container.client.api
         api.timeout = min(api.timeout or _REMOVAL_S, _REMOVAL_S)
         try:
@@ -256,10 +253,10 @@ class AgentContainer:
         except DockerException:
             pass
         except requests.RequestException:
-            api.timeout = _GONE_S  # the next one of this engine need not wait as long
+            api.timeout = _GONE_S  # do not wait as long for the next container of this engine
 
     def _put(self, trees: Mapping[Path, Path], owned: Mapping[Path, int] | None = None) -> None:
-        """Copy folders into it; make others, each with its owner."""
+        """Copy folders into the container; make others, each with its owner."""
         archive = io.BytesIO()
         with tarfile.open(fileobj=archive, mode="w") as tar:
             for folder, user in (owned or {}).items():

@@ -1,7 +1,7 @@
 """Slurm: runs of a sweep as jobs, in an array submitted with submitit; a project as a batch script.
 
-submitit leaves a file with what a job has returned. Whether a job has ended without one is asked of
-``squeue``, and not of ``sacct`` as submitit does, which needs an accounting database.
+submitit writes a file with the result of each job. ``squeue`` tells whether a job has ended without
+one; submitit's ``sacct`` would need an accounting database.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ FOLDER = ".slurm"
 """Logs, jobs and results, in the folder of the sweep."""
 
 _MOST_IN_ARRAY = 1000  # MaxArraySize is 1001 where a cluster does not set it
-_LOOK_S, _ASK_S = 2.0, 15.0
+_POLL_S, _ASK_S = 2.0, 15.0
 _MEBIBYTE = 1 << 20
 _TIMEOUT_S = 60.0
 _UNKNOWN = "unknown to squeue"
@@ -73,7 +73,7 @@ _STEP = ("srun", "--overlap", "--mem=0", "--nodes=1", "--ntasks=1", "--mpi=none"
 class SlurmExecutor(SweepExecutor):
     """Runs as jobs of a Slurm cluster that this machine submits to.
 
-    What else ``sbatch`` is to know it reads from its environment: ``SBATCH_TIMELIMIT``,
+    ``sbatch`` reads further settings from its environment: ``SBATCH_TIMELIMIT``,
     ``SBATCH_ACCOUNT``, ``SBATCH_QOS``.
     """
 
@@ -93,10 +93,12 @@ class SlurmExecutor(SweepExecutor):
                 " submits to the cluster (on Debian: apt-get install slurm-client)"
             )
         executor = submitit.SlurmExecutor(plan.folder / FOLDER)
-        name = _job_name(plan)
+        # A name for the jobs of this sweep alone.
+        digest = hashlib.sha256(str(plan.folder).encode()).hexdigest()[:8]
+        name = f"neuros-{_plain(plan.name)}-{digest}"
         executor.update_parameters(job_name=name, **_parameters(place, plan))
-        # What an earlier call has left waiting is submitted again. What it has left running goes
-        # on: the job of the same run waits for it and takes its result.
+        # Waiting jobs of an earlier call are submitted again. Its running jobs go on, and the jobs
+        # of the same runs wait for them and return their results.
         _slurm("scancel", "--quiet", "--state=PENDING", f"--name={name}")
         jobs = _SlurmJobs(executor, name, plan.count)
         try:
@@ -105,25 +107,20 @@ class SlurmExecutor(SweepExecutor):
             jobs.close()
 
 
-def _job_name(plan: SweepPlan) -> str:
-    """A name for the jobs of this sweep, and of no other."""
-    return f"neuros-{_plain(plan.name)}-{hashlib.sha256(str(plan.folder).encode()).hexdigest()[:8]}"
-
-
 def _plain(name: str) -> str:
-    """The name of a project, as a line of ``#SBATCH`` takes it."""
+    """The name of a project in a form that ``#SBATCH`` accepts."""
     return re.sub(r"[^A-Za-z0-9_-]", "-", name)
 
 
 def _parameters(partition: str | None, plan: SweepPlan) -> dict[str, Any]:
-    """What ``sbatch`` gets; ``None`` for what the cluster decides."""
+    """The parameters of ``sbatch``; ``None`` where the cluster decides."""
     needs = plan.resources
     cpus = ["--cpus-per-task", str(needs.cpus)] if needs.cpus else []
     return {
         "partition": partition,
-        "time": None,  # submitit would say 5 minutes
+        "time": None,  # submitit's default is 5 minutes
         "cpus_per_task": needs.cpus,
-        "srun_args": cpus,  # from 22.05 on, srun does not take it from its job
+        "srun_args": cpus,  # since 22.05 srun does not inherit it from its job
         "additional_parameters": {
             "chdir": "/",  # Python would import from the folder that the job begins in
             **({"mem": f"{-(-needs.mem_bytes // _MEBIBYTE)}M"} if needs.mem_bytes else {}),
@@ -133,7 +130,7 @@ def _parameters(partition: str | None, plan: SweepPlan) -> dict[str, Any]:
 
 
 class _SlurmJobs:
-    """The jobs of one sweep, and a thread that sees them end."""
+    """The jobs of one sweep, and a thread that watches them."""
 
     def __init__(self, executor: Any, name: str, count: int | None) -> None:
         self._executor = executor
@@ -179,15 +176,15 @@ class _SlurmJobs:
     def _watch(self) -> None:
         asked_s = time.monotonic()
         while self._open and not self._is_closed:
-            self._wake.wait(_LOOK_S)
+            self._wake.wait(_POLL_S)
             self._wake.clear()
-            self._take_results()
+            self._read_results()
             if self._is_cancelled or time.monotonic() - asked_s >= _ASK_S:
-                self._give_up_lost()
+                self._fail_lost()
                 asked_s = time.monotonic()
 
-    def _take_results(self) -> None:
-        """Look once into the folder, whatever the number of jobs."""
+    def _read_results(self) -> None:
+        """Set the results of ended jobs; lists the folder once, whatever the number of jobs."""
         names = {file.name for file in Path(self._executor.folder).iterdir()}
         for number, (job, future) in tuple(self._open.items()):
             if job.paths.result_pickle.name not in names:
@@ -198,13 +195,13 @@ class _SlurmJobs:
             except Exception as error:  # what the job raised, or the file is broken
                 future.set_exception(error)
 
-    def _give_up_lost(self) -> None:
-        """Give up jobs without a result that Slurm does not know as going on, twice in a row."""
+    def _fail_lost(self) -> None:
+        """Fail jobs without a result that Slurm reports as ended, or not at all, twice in a row."""
         said = _slurm(
             *("squeue", "--array", "--noheader", "--states=all"),
             *(f"--name={self._name}", "--format=%i %T"),
         )
-        if said is None:  # it does not answer
+        if said is None:  # squeue does not answer
             return
         states = dict(line.split(maxsplit=1) for line in said.splitlines() if line.strip())
         lost = {n for n in self._open if states.get(n, _UNKNOWN) in {*_OVER, _UNKNOWN}}
@@ -220,24 +217,24 @@ class _SlurmJobs:
 
 
 def _slurm(*command: str) -> str | None:
-    """What a command of Slurm says; ``None`` if it fails."""
+    """The output of a command of Slurm; ``None`` if it fails."""
     done = answer_of(command, timeout_s=_TIMEOUT_S)
     return None if done is None or done.returncode else done.stdout
 
 
 def _run_in_job(job: Job) -> Any:
-    """Execute a job where Slurm has started it, which says with signals that it is to end.
+    """Execute a job on its machine; a signal of Slurm ends the run as Ctrl+C would.
 
-    They come with ``scancel``, and some time before the time limit: in place of submitit, which
-    would ignore them or submit the job again, the run is ended as by Ctrl+C.
+    Slurm signals with ``scancel``, and some time before the time limit. This replaces submitit's
+    handlers, which would ignore the signal or submit the job again.
     """
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt(signal.Signals(number).name)
+
     for number in (signal.SIGTERM, signal.SIGUSR2):
-        signal.signal(number, _interrupt)
+        signal.signal(number, interrupt)
     return job()
-
-
-def _interrupt(number: int, frame: FrameType | None) -> None:
-    raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 SLURM = SlurmExecutor()
@@ -254,13 +251,19 @@ def slurm_script(
     """A script for ``sbatch`` that runs a project on the nodes of its allocation.
 
     Args:
-        project: the project, as the first node of the allocation sees it.
+        project: the project's path on the first node of the allocation.
         places: by node of the project, the number of the cluster's node in the allocation, from 0;
-            what is not named runs beside the launcher, on number 0.
+            other nodes run beside the launcher, on number 0.
         neuros: the command ``neuros`` on all of them.
-        options: further ones of ``neuros launch``.
-        resources: what each of them has to have.
+        options: further options of ``neuros launch``.
+        resources: the least resources of each cluster node.
     """
+    needs = resources or JobResources()
+    lines = [
+        *([f"--cpus-per-task={needs.cpus}"] if needs.cpus else []),
+        *([f"--mem={-(-needs.mem_bytes // _MEBIBYTE)}M"] if needs.mem_bytes else []),
+        *([f"--gpus-per-node={needs.gpus}"] if needs.gpus else []),
+    ]
     elsewhere = {node: number for node, number in places.items() if number}
     numbers = sorted({*elsewhere.values()})
     hosts = {
@@ -272,15 +275,7 @@ def slurm_script(
     return _SCRIPT.format(
         name=_plain(name),
         count=max(numbers, default=0) + 1,
-        resources="".join(f"#SBATCH {line}\n" for line in _lines(resources or JobResources())),
+        resources="".join(f"#SBATCH {line}\n" for line in lines),
         deployment=json.dumps({"hosts": hosts, "nodes": nodes}, indent=2),
         command=shlex.join([neuros, "launch", os.fspath(project), *options]),
     )
-
-
-def _lines(needs: JobResources) -> list[str]:
-    return [
-        *([f"--cpus-per-task={needs.cpus}"] if needs.cpus else []),
-        *([f"--mem={-(-needs.mem_bytes // _MEBIBYTE)}M"] if needs.mem_bytes else []),
-        *([f"--gpus-per-node={needs.gpus}"] if needs.gpus else []),
-    ]

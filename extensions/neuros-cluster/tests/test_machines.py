@@ -158,13 +158,13 @@ class TestAgent:
         self, agent: Agent
     ) -> None:
         agent._processes["brain"] = Ended("exit code 0")  # type: ignore[assignment]
-        assert agent._look()
+        assert agent._send_news()
         assert NodeEnded("brain", "exit code 0") in agent._pump.messages  # type: ignore[attr-defined]
 
     def test_nodes_take_turns(self, agent: Agent) -> None:
-        agent._look()
+        agent._send_news()
         agent._in_flight_bytes = 0
-        agent._look()
+        agent._send_news()
         chunks = [each for each in agent._pump.messages if each.data]  # type: ignore[attr-defined]
         assert list(dict.fromkeys(each.path for each in chunks)) == [
             "eye/node.log",
@@ -288,14 +288,14 @@ class TestClock:
     @pytest.fixture
     def clock(self) -> ClockOffset:
         clock = ClockOffset()
-        clock.take(Pong(5.0, 1005.0, 2e9 + 0.5), 5.0, 2e9)
+        clock.add(Pong(5.0, 1005.0, 2e9 + 0.5), 5.0, 2e9)
         return clock
 
     def test_the_fastest_answer_tells_how_far_it_is_ahead(self) -> None:
         clock = ClockOffset()
         for late_s, ahead_s in ((0.5, 1000.2), (0.01, 1000.0), (0.25, 999.9)):
             sent_s, there_s = 50.0, 50.0 + late_s / 2 + ahead_s
-            clock.take(Pong(sent_s, there_s, 2e9 - late_s / 2 - 3.0), sent_s + late_s, 2e9)
+            clock.add(Pong(sent_s, there_s, 2e9 - late_s / 2 - 3.0), sent_s + late_s, 2e9)
         assert clock.round_trip_s == pytest.approx(0.01)
         assert clock.monotonic_s == pytest.approx(1000.0)
         assert clock.unix_s == pytest.approx(-3.0)
@@ -312,7 +312,7 @@ class TestClock:
         for second in range(3600):
             half_s = 0.0001 if second == 0 else 0.001
             sent_s, now_s = second - half_s, second + half_s
-            clock.take(Pong(sent_s, there_s(second), 2e9), now_s, 2e9)
+            clock.add(Pong(sent_s, there_s(second), 2e9), now_s, 2e9)
         assert clock.monotonic_s == pytest.approx(1000.0 + 3600 * drift, abs=0.005)
         here = [0, 1000, 2000, 3000, 3599]
         log = array("q", [round(1e9 * there_s(each)) for each in here])
@@ -332,7 +332,7 @@ class TestClock:
 
     def test_processes_of_one_machine_have_one_clock(self) -> None:
         clock = ClockOffset()
-        clock.take(Pong(50.0, 50.06, 2e9), 50.1, 2e9)
+        clock.add(Pong(50.0, 50.06, 2e9), 50.1, 2e9)
         assert clock.monotonic_s == 0.0
 
     def test_what_nodes_report_is_on_the_clock_of_this_machine(self, clock: ClockOffset) -> None:
