@@ -30,7 +30,7 @@ from neuros_analysis.comparison import comparison_rows
 from neuros_analysis.findings import findings_of
 from neuros_analysis.review import open_for_review
 from neuros_analysis.run_pages import figures_of, panels_page, png, report_page, world_pages
-from neuros_dashboard.live_metrics import LiveRun
+from neuros_dashboard.live_metrics import ObservedRun
 from neuros_dashboard.pages import Pages
 from neuros_dashboard.server import Dashboard
 
@@ -548,7 +548,7 @@ async def answer(
     """The status of the answer of a dashboard; ``None`` where it goes on for ever."""
     here, there = socket.socketpair()
     pages, link = Pages(), ControlLink(here, control.TO_OBSERVERS, "the supervisor")
-    dashboard = Dashboard({}, lambda: None, dict, pages, LiveRun(pages, link, ("a",), 0.0))  # type: ignore[arg-type, return-value]
+    dashboard = Dashboard({}, lambda: None, dict, pages, ObservedRun(pages, link, ("a",), 0.0))  # type: ignore[arg-type, return-value]
     app = dashboard.app(TOKEN, "0123456789abcdef")
     statuses: list[int] = []
     scope = {
