@@ -46,7 +46,7 @@ __all__ = [
 
 _MARK = "__neuros_hooks__"
 _RUNNERS = {"neuros.api.project", "neuros.node.node", "neuros.testing.harness"}
-"""What runs hooks: a program that has loaded one of these is no plugin alone."""
+"""The modules that run hooks: a program that has imported one is more than a plugin."""
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,18 @@ class All:
 
     name: str
 
+    def __repr__(self) -> str:
+        return f"All({self.name!r})"
+
 
 @dataclass(frozen=True)
 class Optional:
     """A port that may stay empty: the hook receives, or may return, ``None`` for it."""
 
     port: str | All
+
+    def __repr__(self) -> str:
+        return f"Optional({self.port!r})"
 
 
 Port: TypeAlias = "str | All | Optional"
@@ -97,10 +103,11 @@ class OutputSpec:
 
 @dataclass(frozen=True)
 class HookSpec:
-    """What a decorator says about one function.
+    """A hook as its decorator declares it.
 
-    ``period_s`` is set for ticks by the wall clock only, ``sim_period_s`` for those by simulated
-    time; a node runs the latter as functions of its clock.
+    Attributes:
+        period_s: of a tick by the wall clock, in seconds.
+        sim_period_s: of a tick by simulated time; a node runs it as a function of its clock.
     """
 
     kind: HookKind
@@ -122,12 +129,12 @@ class HookSpec:
 
     @property
     def is_scheduled(self) -> bool:
-        """Whether the engine of a node runs it."""
+        """Whether the engine runs the hook; the node itself runs reset and finalise hooks."""
         return self.kind not in (HookKind.RESET, HookKind.FINALISE)
 
     @property
     def sends_unasked(self) -> bool:
-        """Whether it can send without having received: a tick, or no required input."""
+        """Whether the hook can send without a received packet: a tick, or no required input."""
         if self.kind is HookKind.TICK:
             return self.sim_period_s is None
         return bool(self.outputs) and all(port.is_optional for port in self.inputs)
@@ -206,32 +213,27 @@ def _marker(
         )
 
     def mark(function: _Function) -> _Function:
-        def fail(text: str) -> HookError:
-            name = getattr(function, "__name__", repr(function))
-            return HookError(text, hook=name, where=_where(function))
-
-        if not callable(function):
-            raise fail(f"@neuros_{kind.value} needs parentheses and a function below it")
-        given = {name: period for name, period in periods.items() if period is not None}
-        if periods and len(given) != 1:
-            raise fail("@neuros_tick needs seconds or sim_seconds, and not both")
-        period = {name: _period(name, value, fail) for name, value in given.items()}
-        spec = HookSpec(
-            kind=kind,
-            function=function,
-            inputs=tuple(_input(port, fail) for port in _listed(inputs, fail)),
-            outputs=tuple(_output(port, fail) for port in _listed(outputs, fail)),
-            period_s=period.get("seconds"),
-            sim_period_s=period.get("sim_seconds"),
-        )
-        for side, names in (
-            ("input", [port.name for port in spec.inputs]),
-            ("output", [port.name for port in spec.outputs]),
-        ):
-            for name in sorted({name for name in names if names.count(name) > 1}):
-                raise fail(f"{side} '{name}' is named twice")
+        try:
+            if not callable(function):
+                raise ValueError(f"@neuros_{kind.value} needs parentheses and a function below it")
+            name, period_s = period_of(periods) if periods else ("", None)
+            spec = HookSpec(
+                kind,
+                function,
+                tuple(map(input_of, _listed(inputs))),
+                tuple(map(output_of, _listed(outputs))),
+                period_s=period_s if name == "seconds" else None,
+                sim_period_s=period_s if name == "sim_seconds" else None,
+            )
+            for side, ports in (("input", spec.inputs), ("output", spec.outputs)):
+                names = [port.name for port in ports]
+                if twice := [each for each in names if names.count(each) > 1]:
+                    raise ValueError(f"{side} '{twice[0]}' is named twice")
+        except ValueError as error:
+            hook = getattr(function, "__name__", repr(function))
+            raise HookError(str(error), hook=hook, where=_where(function)) from None
         if function.__module__ == "__main__":
-            _note_program(getattr(sys.modules["__main__"], "__file__", None))
+            _explain_at_exit(getattr(sys.modules["__main__"], "__file__", None))
         # A function may carry several marks; the uppermost decorator is applied last.
         setattr(function, _MARK, (spec, *_marks(function)))
         return function
@@ -240,57 +242,65 @@ def _marker(
 
 
 @cache
-def _note_program(file: str | None) -> None:
-    """A plugin is run as a program: at its end it says that this only defines functions."""
+def _explain_at_exit(file: str | None) -> None:
+    """Tell at the exit of a plugin that was run as a program that it has only defined hooks."""
+
+    def explain() -> None:
+        if not _RUNNERS & sys.modules.keys():
+            print(
+                f"{file} is a plugin: by itself it only defines hooks, and none has run. Run the"
+                f" project that names it: neuros launch {os.path.dirname(str(file)) or '.'}",
+                file=sys.stderr,
+            )
+
     if file is not None:
-        atexit.register(_say_how_to_run, file)
+        atexit.register(explain)
 
 
-def _say_how_to_run(file: str) -> None:
-    if not _RUNNERS & sys.modules.keys():
-        print(
-            f"{file} is a plugin: by itself it only defines hooks, and none has run. Run the"
-            f" project that names it: neuros launch {os.path.dirname(file) or '.'}",
-            file=sys.stderr,
-        )
-
-
-def _listed(ports: Ports, fail: Callable[[str], HookError]) -> list[Port]:
+def _listed(ports: Ports) -> list[Port]:
     if ports is None:
         return []
     if isinstance(ports, str | All | Optional):
         return [ports]
     if not isinstance(ports, Iterable):
-        raise fail(f"{ports!r} is not a port: give a name, or a list of names")
+        raise ValueError(f"{ports!r} is not a port: give a name, or a list of names")
     return list(ports)
 
 
-def _input(port: object, fail: Callable[[str], HookError]) -> InputSpec:
+def input_of(port: object) -> InputSpec:
+    """The input that one entry of ``inputs`` declares. Raises ``ValueError``."""
     inner = port.port if isinstance(port, Optional) else port
     name = inner.name if isinstance(inner, All) else inner
     if not isinstance(name, str):
-        raise fail(
-            f"{port!r} is not an input: give a name, Optional(name), All(name) or"
-            " Optional(All(name))"
-        )
+        allowed = "a name, Optional(name), All(name) or Optional(All(name))"
+        raise ValueError(f"{port!r} is not an input: give {allowed}")
     return InputSpec(name, isinstance(inner, All), isinstance(port, Optional))
 
 
-def _output(port: object, fail: Callable[[str], HookError]) -> OutputSpec:
+def output_of(port: object) -> OutputSpec:
+    """The output that one entry of ``outputs`` declares. Raises ``ValueError``."""
     inner = port.port if isinstance(port, Optional) else port
     if isinstance(inner, All):
-        raise fail(f"output '{inner.name}' is wrapped in All, which is for inputs only")
+        raise ValueError(f"output '{inner.name}' is wrapped in All, which is for inputs only")
     if not isinstance(inner, str):
-        raise fail(f"{port!r} is not an output: give a name or Optional(name)")
+        raise ValueError(f"{port!r} is not an output: give a name or Optional(name)")
     return OutputSpec(inner, isinstance(port, Optional))
 
 
-def _period(name: str, seconds: float, fail: Callable[[str], HookError]) -> float:
+def period_of(periods: Mapping[str, Any]) -> tuple[str, float]:
+    """The argument that sets the period of a tick, and the period in seconds.
+
+    ``periods`` has the values of ``seconds`` and ``sim_seconds``. Raises ``ValueError``.
+    """
+    given = [(name, value) for name, value in periods.items() if value is not None]
+    if len(given) != 1:
+        raise ValueError("@neuros_tick needs seconds or sim_seconds, and not both: seconds=0.02")
+    ((name, seconds),) = given
     if isinstance(seconds, bool) or not isinstance(seconds, int | float):
-        raise fail(f"{name}={seconds!r} is not a number")
+        raise ValueError(f"{name}={seconds!r} is not a number")
     if not (math.isfinite(seconds) and seconds > 0):
-        raise fail(f"{name}={seconds!r} is not a positive time")
-    return float(seconds)
+        raise ValueError(f"{name}={seconds!r} is not a positive time")
+    return name, float(seconds)
 
 
 def _where(function: object) -> str:

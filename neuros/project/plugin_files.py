@@ -1,14 +1,14 @@
-"""Hooks and ports that a plugin declares, read without running it.
+"""Hooks and ports that a plugin declares, read from its syntax tree without running it.
 
-Only what is written as a literal is looked at. A name that is computed, a hook inside of an ``if``,
-a decorator of another library: of those nothing is said, here or in
-:mod:`neuros.project.checks`.
+Only literals are read, and judged as the decorators of :mod:`neuros.hooks` judge their arguments. A
+computed name, a hook inside of an ``if``, a decorator of another library are unknown: neither this
+module nor :mod:`neuros.project.checks` reports a problem with them.
 """
 
 from __future__ import annotations
 
 import ast
-import math
+import inspect
 import re
 import sys
 import threading
@@ -19,34 +19,36 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from neuros import hooks
+from neuros.hooks import InputSpec, input_of, output_of, period_of
 from neuros.project.scanner import read_bytes
 from neuros.project.suggest import did_you_mean
 
 _MOST_BYTES = 4 << 20
 _HOOKS = "neuros.hooks"
 _ARGUMENTS = {
-    "neuros_initialise": ("inputs", "outputs"),
-    "neuros_tick": ("seconds", "inputs", "outputs", "sim_seconds"),
-    "neuros_function": ("inputs", "outputs"),
-    "neuros_reset": ("inputs", "outputs"),
-    "neuros_finalise": (),
+    name: tuple(inspect.signature(getattr(hooks, name)).parameters)
+    for name in hooks.__all__
+    if name.startswith("neuros_")
 }
-_FOR_TOOLS = ("HookKind", "HookSpec", "InputSpec", "OutputSpec", "hook_specs_of")
-PUBLIC_NAMES = ("All", "Optional", *_ARGUMENTS, *_FOR_TOOLS)
-"""What there is in ``neuros.hooks``."""
+_WRAPPERS = {"All": hooks.All, "Optional": hooks.Optional}
 
-# Packages whose functions are no hooks; those of any other one may be.
-_WITHOUT_HOOKS = {"matplotlib", "mujoco", "nest", "numpy", "rclpy", "scipy"}
-# With these, a plugin may make hooks in ways that are not to be seen.
+# Packages whose functions are no hooks; a function of any other package may be one.
+_WITHOUT_HOOKS = {"matplotlib", "mujoco", "nest", "neuros", "numpy", "rclpy", "scipy"}
+# With these names, a plugin may make hooks that its syntax tree does not show.
 _DYNAMIC = {"__import__", "eval", "exec", "globals", "import_module", "locals", "setattr", "vars"}
-# What sends packets from a thread of the plugin.
+# Methods of the node and of simulators that send packets from a thread.
 _SENDERS = {"run_asynchronous", "submit"}
-# What later versions of Python know: the node may run on one of those.
+# Syntax of later versions of Python, on which the node may run.
 _NEWER = (
     ((3, 11), re.compile(r"\s*except\s*\*")),
     ((3, 12), re.compile(r"\s*(type\s+\w+|((async\s+)?def|class)\s+\w+\s*\[)")),
     ((3, 14), re.compile(r"\s*except\s[^(]*,|.*\b[tT][rR]?['\"]")),
 )
+_MUJOCO = {
+    "neuros.simulators.mujoco.MuJoCo",
+    "neuros.simulators.mujoco.simulator.MuJoCo",
+}
 _Function: TypeAlias = "ast.FunctionDef | ast.AsyncFunctionDef"
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -74,10 +76,12 @@ class DeclaredPort:
 
 @dataclass(frozen=True)
 class DeclaredHook:
-    """A hook that the plugin has in any case; its ports are ``None`` where they are computed.
+    """A hook that the plugin has in any case.
 
-    ``sim_tick``: line and column of the period, if it ticks by simulated time; ``kind`` is that of
-    its decorator, as ``neuros_tick``.
+    Attributes:
+        inputs, outputs: ``None`` where their number is computed.
+        sim_tick: line and column of the period, for a tick by simulated time.
+        kind: the name of the decorator, as ``neuros_tick``.
     """
 
     name: str
@@ -89,7 +93,7 @@ class DeclaredHook:
 
 @dataclass(frozen=True)
 class NeededModule:
-    """A module that is imported in any case; ``name`` begins with dots where that is relative."""
+    """A module that is imported in any case; ``name`` begins with dots if relative."""
 
     name: str
     line: int
@@ -98,19 +102,19 @@ class NeededModule:
 
 @dataclass
 class PluginFile:
-    """A plugin, read.
+    """The content of a plugin, as far as its syntax tree tells.
 
     Attributes:
-        hooks: those that are known.
-        mistakes: what would keep a node with any ports from starting.
-        doubts: what may be a mistake.
-        imports: the modules that it imports.
+        hooks: the known hooks.
+        mistakes: keep a node from starting, whatever ports it has.
+        doubts: possible mistakes.
+        imports: names of all imported modules.
         texts: all text constants.
-        model_arguments: what is given to ``MuJoCo`` as its model.
-        sets_timestep: whether it may change the timestep of a model.
-        needs: the modules without which it cannot be imported.
-        is_whole: whether ``hooks`` are all that it has, but for those that ``functions_of`` bring.
-        functions_of: the modules that it imports functions from.
+        model_arguments: the expressions given to ``MuJoCo`` as its model.
+        sets_timestep: whether the plugin may change the timestep of a model.
+        needs: the modules without which the plugin cannot be imported.
+        is_whole: whether ``hooks`` has every hook, but for hooks of modules in ``functions_of``.
+        functions_of: the modules from which the plugin imports functions.
         sends_by_itself: whether packets may come from a thread, as from a simulation.
     """
 
@@ -129,7 +133,7 @@ class PluginFile:
 
 
 def read_plugin(path: Path) -> PluginFile | None:
-    """What a plugin declares; ``None`` if the file cannot be read, or is a compiled one."""
+    """The declarations of a plugin; ``None`` if the file cannot be read, or is compiled."""
     if path.suffix != ".py":
         return None
     try:
@@ -160,13 +164,13 @@ def _read(path: Path, *_: int) -> PluginFile:
             plugin.mistakes.append(Remark(1, 1, f"syntax error: {error}"))
         else:
             _Reader(plugin, tree).read()
-    except (RecursionError, MemoryError):  # so deeply nested that Python gives up, in either way
+    except (RecursionError, MemoryError):  # Python raises either for code nested too deeply
         pass
     return plugin
 
 
 def _may_be_newer(error: SyntaxError, source: bytes) -> bool:
-    """Whether it may be right in a later version of Python."""
+    """Whether the source may be right in a later version of Python."""
     lines = source.decode("utf-8", "replace").splitlines()
     line = lines[error.lineno - 1] if error.lineno and error.lineno <= len(lines) else ""
     if sys.version_info < (3, 12) and (error.msg or "").startswith("f-string"):
@@ -177,7 +181,7 @@ def _may_be_newer(error: SyntaxError, source: bytes) -> bool:
 class _Reader:
     """Reads one plugin.
 
-    A name has a meaning where all its bindings, in all scopes, are equal.
+    A name has a known meaning if all its bindings, in all scopes, are equal.
     """
 
     def __init__(self, plugin: PluginFile, tree: ast.Module) -> None:
@@ -191,52 +195,55 @@ class _Reader:
 
     def read(self) -> None:
         plugin, nodes = self._plugin, self._nodes
-        self._read_statements()
-        if not plugin.hooks and not plugin.mistakes and not self._may_have_hooks():
+        lines: dict[str, int] = {}  # of the last hook of each name
+        for statement in self._tree.body:  # functions in an ``if`` are not read
+            if isinstance(statement, (*_FUNCTIONS, ast.ClassDef)):
+                name, line = statement.name, statement.lineno
+                if name in lines:
+                    text = f"hook '{name}' never runs: line {line} defines another '{name}'"
+                    plugin.doubts.append(Remark(lines.pop(name), 1, text))
+                if isinstance(statement, _FUNCTIONS) and self._read_hooks(statement):
+                    lines[name] = line
+            elif isinstance(statement, ast.ImportFrom) and _module(statement) == _HOOKS:
+                for alias in statement.names:
+                    if alias.name not in ("*", *hooks.__all__):
+                        hint = did_you_mean(alias.name, hooks.__all__)
+                        self._mistake(statement, f"neuros.hooks has no '{alias.name}'", hint)
+        attributes = [each for each in nodes if isinstance(each, ast.Attribute)]
+        names = [each for each in nodes if isinstance(each, ast.Name)]
+        words = {*(each.attr for each in attributes), *(each.id for each in names)}
+        plugin.functions_of = frozenset(
+            _module(each)
+            for each in nodes
+            if isinstance(each, ast.ImportFrom) and not _brings_no_functions(each)
+        )
+        has_other_hooks = (
+            any(module != _HOOKS for module in self._stars)
+            or words & (_DYNAMIC | {*_ARGUMENTS})
+            or plugin.functions_of
+        )
+        if not plugin.hooks and not plugin.mistakes and not has_other_hooks:
             hint = "mark functions with @neuros_function or @neuros_tick from neuros.hooks"
             plugin.mistakes.append(Remark(1, 1, "declares no hooks", hint))
         constants = (node.value for node in nodes if isinstance(node, ast.Constant))
         plugin.texts = frozenset(value for value in constants if isinstance(value, str))
-        plugin.model_arguments = tuple(self._model_arguments())
-        marks = {f"{_HOOKS}.{name}" for name in _ARGUMENTS}
-        expressions = [each for each in nodes if isinstance(each, ast.Name | ast.Attribute)]
-        found = [each for each in expressions if self._meaning(each) in marks]
-        is_computed = any(_names_in(each) & _DYNAMIC for each in nodes)
-        plugin.is_whole = not is_computed and len(found) == len(plugin.hooks)
-        brought = [each for each in nodes if isinstance(each, ast.ImportFrom)]
-        plugin.functions_of = frozenset(
-            "." * each.level + (each.module or "")
-            for each in brought
-            if not _brings_no_functions(each)
-        )
-        is_path_changed = any(
-            isinstance(each, ast.Attribute) and self._meaning(each) == "sys.path" for each in nodes
-        )
-        plugin.needs = () if is_path_changed else tuple(_needed_in(self._tree.body))
-        plugin.sends_by_itself = any(
-            isinstance(each, ast.Attribute) and each.attr in _SENDERS for each in nodes
-        )
-        plugin.sets_timestep = any(
-            node.attr in ("opt", "option")
-            or (node.attr == "timestep" and isinstance(node.ctx, ast.Store))
+        plugin.model_arguments = tuple(
+            self._assigned(given[0]) if given else ast.Constant(None)
             for node in nodes
-            if isinstance(node, ast.Attribute)
+            if isinstance(node, ast.Call) and self._meaning(node.func) in _MUJOCO
+            for given in [[k.value for k in node.keywords if k.arg == "model"] or node.args[1:2]]
         )
-
-    def _read_statements(self) -> None:
-        """What is executed in any case when the plugin is imported."""
-        lines: dict[str, int] = {}  # of the last hook of each name
-        for statement in self._tree.body:
-            if isinstance(statement, ast.ImportFrom):
-                self._check_import(statement)
-            if not isinstance(statement, (*_FUNCTIONS, ast.ClassDef)):
-                continue
-            name, line = statement.name, statement.lineno
-            if name in lines:
-                text = f"hook '{name}' never runs: line {line} defines another '{name}'"
-                self._plugin.doubts.append(Remark(lines.pop(name), 1, text))
-            if isinstance(statement, _FUNCTIONS) and self._read_function(statement):
-                lines[name] = line
+        meanings = [self._meaning(each) for each in (*names, *attributes)]
+        marks = [each for each in meanings if each.rpartition(".")[2] in _ARGUMENTS]
+        marks = [each for each in marks if each.startswith(f"{_HOOKS}.")]
+        plugin.is_whole = not words & _DYNAMIC and len(marks) == len(plugin.hooks)
+        plugin.needs = () if "sys.path" in meanings else tuple(_needed_in(self._tree.body))
+        plugin.sends_by_itself = any(each.attr in _SENDERS for each in attributes)
+        plugin.sets_timestep = any(
+            each.attr in ("opt", "option")
+            or (each.attr == "timestep" and isinstance(each.ctx, ast.Store))
+            for each in attributes
+        )
 
     # ------------------------------------------------------------------ what names mean
 
@@ -250,7 +257,7 @@ class _Reader:
                 top = alias.name.partition(".")[0]
                 bind(alias.asname or top, alias.name if alias.asname else top)
         elif isinstance(node, ast.ImportFrom):
-            module = "." * node.level + (node.module or "")
+            module = _module(node)
             self._plugin.imports |= {module}
             for alias in node.names:
                 if alias.name == "*":
@@ -262,12 +269,6 @@ class _Reader:
         elif isinstance(node, (*_FUNCTIONS, ast.ClassDef)):
             bind(node.name, "")
 
-    def _check_import(self, node: ast.ImportFrom) -> None:
-        for alias in node.names if node.module == _HOOKS and not node.level else ():
-            if alias.name not in ("*", *PUBLIC_NAMES):
-                hint = did_you_mean(alias.name, PUBLIC_NAMES)
-                self._mistake(node, f"neuros.hooks has no '{alias.name}'", hint)
-
     def _meaning(self, expression: ast.expr) -> str:
         """The dotted name behind an expression, empty if it is not known."""
         if isinstance(expression, ast.Attribute):
@@ -276,7 +277,7 @@ class _Reader:
         if not isinstance(expression, ast.Name):
             return ""
         origins = self._origins.get(expression.id, set())
-        if not origins and self._stars == [_HOOKS] and expression.id in PUBLIC_NAMES:
+        if not origins and self._stars == [_HOOKS] and expression.id in hooks.__all__:
             return f"{_HOOKS}.{expression.id}"
         return next(iter(origins)) if len(origins) == 1 else ""
 
@@ -287,64 +288,62 @@ class _Reader:
             return name
         if not isinstance(expression, ast.Name) or self._stars:
             return ""
-        if expression.id not in PUBLIC_NAMES or expression.id in self._origins:
+        if expression.id not in hooks.__all__ or expression.id in self._origins:
             return ""
         import_ = f"from neuros.hooks import {expression.id}"
         self._mistake(expression, f"'{expression.id}' is not imported", import_)
         return expression.id
 
-    def _may_have_hooks(self) -> bool:
-        """Whether hooks may come from somewhere else."""
-        if any(module != _HOOKS for module in self._stars):
-            return True
-        for node in self._nodes:
-            if _names_in(node) & (_DYNAMIC | {*_ARGUMENTS}):
-                return True
-            if isinstance(node, ast.ImportFrom) and not _brings_no_functions(node):
-                return True
-        return False
-
-    def _model_arguments(self) -> Iterator[ast.expr]:
-        for node in self._nodes:
-            if isinstance(node, ast.Call) and self._meaning(node.func) in (
-                "neuros.simulators.mujoco.MuJoCo",
-                "neuros.simulators.mujoco.simulator.MuJoCo",
-            ):
-                given = [k.value for k in node.keywords if k.arg == "model"] or node.args[1:2]
-                yield self._value(given[0]) if given else ast.Constant(None)
-
-    def _value(self, expression: ast.expr) -> ast.expr:
+    def _assigned(self, expression: ast.expr) -> ast.expr:
         """The value of a name that is bound once; any other expression unchanged."""
         if isinstance(expression, ast.Name):
             name = expression.id
-            made = [each for each in self._nodes if getattr(each, "targets", None)]
-            values = [a.value for a in made if isinstance(a, ast.Assign) and _binds(a, name)]
+            values = [
+                each.value
+                for each in self._nodes
+                if isinstance(each, ast.Assign)
+                and any(isinstance(to, ast.Name) and to.id == name for to in each.targets)
+            ]
             stores = [n for n in self._nodes if isinstance(n, ast.Name) and n.id == name]
             if sum(not isinstance(n.ctx, ast.Load) for n in stores) == len(values) == 1:
                 return values[0]
         return expression
 
+    def _literal(self, expression: ast.expr) -> Any:
+        """The value of a literal, in ``All`` and ``Optional`` too. Raises ``ValueError`` else."""
+        if not isinstance(expression, ast.Call):
+            return ast.literal_eval(expression)
+        arguments = [*expression.args, *(keyword.value for keyword in expression.keywords)]
+        wrapper = _WRAPPERS.get(self._of_hooks(expression.func))
+        if wrapper is None or len(arguments) != 1:
+            raise ValueError("computed")
+        return wrapper(self._literal(arguments[0]))
+
     # ------------------------------------------------------------------ hooks
 
-    def _read_function(self, function: _Function) -> bool:
-        """Read the hooks that a function is; returns whether it is any."""
-        marks = [(each, self._kind(each)) for each in function.decorator_list]
-        is_plain = all(kind for _, kind in marks)
-        for decorator, kind in marks:
-            if not kind:
+    def _read_hooks(self, function: _Function) -> bool:
+        """Read the decorators of a function; returns whether one of them marks a hook."""
+        kinds = [
+            self._of_hooks(each.func if isinstance(each, ast.Call) else each)
+            for each in function.decorator_list
+        ]
+        is_plain = all(kind in _ARGUMENTS for kind in kinds)
+        for decorator, kind in zip(function.decorator_list, kinds, strict=True):
+            if kind not in _ARGUMENTS:
                 continue
             hook = self._hook(function, decorator, kind)
             self._plugin.hooks.append(hook)
             if is_plain and hook.inputs is not None:
                 self._check_signature(function, hook.inputs)
-        if is_plain and marks:
-            self._check_kind_of_function(function)
-        return any(kind for _, kind in marks)
-
-    def _kind(self, decorator: ast.expr) -> str:
-        called = decorator.func if isinstance(decorator, ast.Call) else decorator
-        name = self._of_hooks(called)
-        return name if name in _ARGUMENTS else ""
+        if is_plain and kinds:
+            who = f"hook '{function.name}'"
+            if isinstance(function, ast.AsyncFunctionDef):
+                hint = "only callbacks of ROS may be coroutines"
+                self._mistake(function, f"{who} is a coroutine, and would never run", hint)
+            elif any(isinstance(node, ast.Yield | ast.YieldFrom) for node in _own_nodes(function)):
+                text = f"{who} has 'yield', and would never run"
+                self._mistake(function, text, "a hook returns its packets")
+        return any(kind in _ARGUMENTS for kind in kinds)
 
     def _hook(self, function: _Function, decorator: ast.expr, kind: str) -> DeclaredHook:
         unknown = DeclaredHook(function.name, None, None, kind=kind)
@@ -369,92 +368,65 @@ class _Reader:
                 given[keyword.arg] = keyword.value
         if not is_known:
             return unknown
-        is_right = kind == "neuros_tick" and self._check_period(function, decorator, given)
-        period = given.get("sim_seconds") if is_right else None
         return DeclaredHook(
             function.name,
             self._ports(function, given.get("inputs"), "input"),
             self._ports(function, given.get("outputs"), "output"),
-            None if period is None else (period.lineno, period.col_offset + 1),
+            self._sim_tick(function, decorator, given) if kind == "neuros_tick" else None,
             kind,
         )
 
-    def _check_period(
+    def _sim_tick(
         self, function: _Function, decorator: ast.expr, given: Mapping[str, ast.expr]
-    ) -> bool:
-        """Report what is wrong with the period of a tick; returns whether nothing is."""
-        nothing = (name for name, each in given.items() if ast.unparse(each) == "None")
-        periods = sorted({"seconds", "sim_seconds"} & (given.keys() - {*nothing}))
-        if len(periods) != 1:
-            text = "@neuros_tick needs seconds or sim_seconds, and not both"
-            self._fail(function, decorator, text, "seconds=0.02")
-            return False
-        (name,) = periods
-        seconds = given[name]
+    ) -> tuple[int, int] | None:
+        """Line and column of the period, if a tick is right, and by simulated time."""
+        written, values = dict[str, ast.expr](), dict[str, Any]()
+        for name in ("seconds", "sim_seconds"):
+            if name in given and ast.unparse(given[name]) != "None":
+                written[name] = given[name]
+                try:
+                    values[name] = self._literal(given[name])
+                except (TypeError, ValueError):
+                    values[name] = 1.0  # it is computed, and may be right
         try:
-            value = ast.literal_eval(seconds)
-        except (TypeError, ValueError):
-            return True
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            self._fail(function, seconds, f"{name}={value!r} is not a number")
-        elif not (math.isfinite(value) and value > 0):
-            self._fail(function, seconds, f"{name}={value!r} is not a positive time")
-        else:
-            return True
-        return False
+            name, _ = period_of(values)
+        except ValueError as error:
+            place = decorator if len(written) != 1 else next(iter(written.values()))
+            self._fail(function, place, str(error))
+            return None
+        period = written[name]
+        return (period.lineno, period.col_offset + 1) if name == "sim_seconds" else None
 
     def _ports(
         self, function: _Function, written: ast.expr | None, side: str
     ) -> tuple[DeclaredPort, ...] | None:
+        """The ports of one side; ``None`` where even their number is computed."""
         if written is None or (isinstance(written, ast.Constant) and written.value is None):
             return ()
-        if isinstance(written, ast.Dict):
-            return None  # its keys are the ports
         is_list = isinstance(written, ast.List | ast.Tuple | ast.Set)
         entries = written.elts if isinstance(written, ast.List | ast.Tuple | ast.Set) else [written]
-        ports = [self._port(function, entry, side) for entry in entries]
-        found = tuple(port for port in ports if port)
-        if len(found) < len(ports):
-            return None
-        if not is_list and found[0].name is None:
-            return None  # it may be a list of ports
-        names = [port.name for port in found]
-        for index, (entry, name) in enumerate(zip(entries, names, strict=True)):
-            if name is not None and names.index(name) < index:
-                self._fail(function, entry, f"{side} '{name}' is named twice")
-        return found
-
-    def _port(self, function: _Function, entry: ast.expr, side: str) -> DeclaredPort | None:
-        """One port; ``None`` where even their number is not known."""
-        if isinstance(entry, ast.Starred):
-            return None
-        inner, wrappers = entry, list[str]()
-        while isinstance(inner, ast.Call) and (
-            (name := self._of_hooks(inner.func)) in ("All", "Optional")
-        ):
-            arguments = [*inner.args, *(keyword.value for keyword in inner.keywords)]
-            if len(arguments) != 1:
-                break
-            wrappers.append(name)
-            inner = arguments[0]
-        value = inner.value if isinstance(inner, ast.Constant) else None
-        if not isinstance(value, str):
-            if isinstance(inner, ast.Constant | ast.Dict | ast.List | ast.Tuple | ast.Set):
-                self._not_a_port(function, entry, side)
-            return DeclaredPort(None, entry.lineno, entry.col_offset + 1)
-        if side == "output" and "All" in wrappers:
-            text = f"output '{value}' is wrapped in All, which is for inputs only"
-            self._fail(function, entry, text)
-        elif wrappers not in ([], ["Optional"], ["All"], ["Optional", "All"]):
-            self._not_a_port(function, entry, side)
-        return DeclaredPort(
-            value, entry.lineno, entry.col_offset + 1, "All" in wrappers, "Optional" in wrappers
-        )
-
-    def _not_a_port(self, function: _Function, entry: ast.expr, side: str) -> None:
-        more = ", Optional(name), All(name) or Optional(All(name))"
-        allowed = f"a name{more}" if side == "input" else "a name or Optional(name)"
-        self._fail(function, entry, f"{ast.unparse(entry)} is not an {side}", f"give {allowed}")
+        if any(isinstance(entry, ast.Starred | ast.Dict) for entry in entries):
+            return None  # the keys of a dict are ports
+        found: list[DeclaredPort] = []
+        for entry in entries:
+            place = entry.lineno, entry.col_offset + 1
+            try:
+                value = self._literal(entry)
+            except (TypeError, ValueError):
+                if not is_list:
+                    return None  # it may be a list of ports
+                found.append(DeclaredPort(None, *place))
+                continue
+            try:
+                spec = input_of(value) if side == "input" else output_of(value)
+                if any(port.name == spec.name for port in found):
+                    raise ValueError(f"{side} '{spec.name}' is named twice")
+            except ValueError as error:
+                self._fail(function, entry, str(error))
+                return None
+            is_all = isinstance(spec, InputSpec) and spec.is_all
+            found.append(DeclaredPort(spec.name, *place, is_all, spec.is_optional))
+        return tuple(found)
 
     def _check_signature(self, function: _Function, inputs: Sequence[DeclaredPort]) -> None:
         """Whether it can be called with the node and its inputs."""
@@ -480,15 +452,6 @@ class _Reader:
             hint = "packets come in the order of the declaration"
             self._plugin.doubts.append(_remark(function, text, hint))
 
-    def _check_kind_of_function(self, function: _Function) -> None:
-        who = f"hook '{function.name}'"
-        if isinstance(function, ast.AsyncFunctionDef):
-            hint = "only callbacks of ROS may be coroutines"
-            self._mistake(function, f"{who} is a coroutine, and would never run", hint)
-        elif any(isinstance(node, ast.Yield | ast.YieldFrom) for node in _own_nodes(function)):
-            text = f"{who} has 'yield', and would never run"
-            self._mistake(function, text, "a hook returns its packets")
-
     def _fail(self, function: _Function, node: ast.AST, text: str, hint: str = "") -> None:
         self._mistake(node, f"hook '{function.name}': {text}", hint)
 
@@ -503,27 +466,23 @@ def _remark(node: ast.AST, text: str, hint: str = "") -> Remark:
 
 
 def _needed_in(statements: Sequence[ast.stmt]) -> Iterator[NeededModule]:
-    """What is imported in any case, and not only if it is there."""
+    """The modules of import statements that are executed in any case."""
     for each in statements:
         place = each.lineno, each.col_offset + 1
         if isinstance(each, ast.Import):
             yield from (NeededModule(alias.name, *place) for alias in each.names)
         elif isinstance(each, ast.ImportFrom):
-            yield NeededModule("." * each.level + (each.module or ""), *place)
+            yield NeededModule(_module(each), *place)
         elif isinstance(each, ast.ClassDef):
             yield from _needed_in(each.body)
 
 
-def _names_in(node: ast.AST) -> set[Any]:
-    return {getattr(node, "id", None), getattr(node, "attr", None)}
-
-
-def _binds(assignment: ast.Assign, name: str) -> bool:
-    return any(isinstance(each, ast.Name) and each.id == name for each in assignment.targets)
+def _module(node: ast.ImportFrom) -> str:
+    return "." * node.level + (node.module or "")
 
 
 def _own_nodes(function: _Function) -> Iterator[ast.AST]:
-    """What is in a function, but not in those that it defines itself."""
+    """The nodes of a function without those of functions and classes inside of it."""
     waiting: list[ast.AST] = [*function.body]
     while waiting:
         node = waiting.pop()
@@ -533,10 +492,8 @@ def _own_nodes(function: _Function) -> Iterator[ast.AST]:
 
 
 def _brings_no_functions(node: ast.ImportFrom) -> bool:
-    """Whether what is imported cannot be a hook: a function of Python's own library, or a class."""
+    """Whether no imported name can be a hook: functions of libraries, and classes, are none."""
     top = (node.module or "").partition(".")[0]
     if node.level == 0 and (top in sys.stdlib_module_names or top in _WITHOUT_HOOKS):
-        return True
-    if node.level == 0 and top == "neuros":
         return True
     return all(alias.name[:1].isupper() for alias in node.names)
