@@ -1,4 +1,4 @@
-"""The key ``"dashboard"`` of a project: which panels the page of a run has, and its checks."""
+"""The key ``"dashboard"`` of a project: the panels of a run's page, and their checks."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ARRAYS: Mapping[str, str] = {
 }
 """By message type, the array that is drawn unless ``field`` names another one."""
 
-# What a panel must say, and what it may say, besides its size.
+# By panel, the keys that it must have, and those that it may have besides its size.
 _KEYS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     **dict.fromkeys(("world", "graph", "details", "connections", "nodes", "log", "load"), ((), ())),
     "series": ((), ("fields",)),
@@ -37,13 +37,13 @@ _SIZE = ("panel", "width", "height")
 
 
 def dashboard_of(parsed: ParsedProject) -> Mapping[str, Any] | None:
-    """The layout of a valid project, as it is written; ``None`` if it has none."""
+    """The layout in a valid project file; ``None`` if it has none."""
     element = parsed.root.member("dashboard")
     return None if element is None else element.plain
 
 
 def dashboard_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
-    """Panels that occur twice, keys without meaning, outputs and fields that do not fit."""
+    """Panels that occur twice, keys without meaning, unsuitable outputs and fields."""
     dashboard = parsed.root.member("dashboard")
     types = _types(parsed) if dashboard is not None else {}
     seen: set[str] = set()
@@ -69,7 +69,11 @@ def dashboard_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
             if output is not None and isinstance(output.value, str):
                 yield from _misfit(kind, panel, output, types, is_complete=parsed.is_complete)
         for element in {"activity": [panel], "series": panel.items("fields")}.get(kind, ()):
-            yield from _field_misfit(element, types, parsed, wants_array=kind == "activity")
+            path, type_name = element.string("field"), types.get(element.string("output") or "", "")
+            if path and normalised(type_name):
+                packages, is_array = parsed.roots.packages, kind == "activity"
+                if wrong := misfit(type_name, path, packages, wants_array=is_array):
+                    yield element.value["field"].problem(*wrong)
 
 
 _ALL_KEYS = {key for needed, allowed in _KEYS.values() for key in (*needed, *allowed)}
@@ -105,14 +109,3 @@ def _misfit(
     elif kind == "activity" and type_name not in (SPIKES, *ARRAYS) and "field" not in panel.value:
         text = f"which array of {type_name} is to be drawn?"
         yield panel.problem(text, "name it with 'field', as \"data\"")
-
-
-def _field_misfit(
-    element: Element, types: Mapping[str, str], parsed: ParsedProject, *, wants_array: bool
-) -> Iterator[Problem]:
-    """A field that the messages of the output do not have, or that cannot be drawn."""
-    path, type_name = element.string("field"), types.get(element.string("output") or "", "")
-    if path and normalised(type_name):
-        wrong = misfit(type_name, path, parsed.roots.packages, wants_array=wants_array)
-        if wrong is not None:
-            yield element.value["field"].problem(*wrong)

@@ -31,19 +31,28 @@ def graph_text(project: Project) -> str:
     if project.description:
         lines.append(project.description)
     for node in project.nodes:
-        lines += ["", *_node_lines(project, node)]
+        lines += ["", f"{node.name}  ({node.container}, {node.plugin_name})"]
+        ports = [
+            *((port, "in ") for port in node.inputs),
+            *((port, "out") for port in node.outputs),
+        ]
+        width = max((len(port.name) for port, _ in ports), default=0)
+        for port, side in ports:
+            lines.append(f"  {side} {port.name:<{width}}  {port.type}")
+            lines += _ends(project, node, port, is_input=side == "in ")
     return "\n".join(lines) + "\n"
 
 
 def graph_mermaid(project: Project) -> str:
-    """The same for Mermaid: thick arrows are lossless, dotted ones best effort."""
+    """The graph for Mermaid: thick arrows are lossless, dotted ones best effort."""
     identity = {node.name: f"n{index}" for index, node in enumerate(project.nodes)}
     lines = ["flowchart LR"]
     for node in project.nodes:
         lines.append(f'    {identity[node.name]}["{node.name}<br/>{_safe(node.container)}"]')
     for c in project.connections:
+        arrow = "==>" if c.discard_limit == 0 else "-->" if c.is_reliable else "-.->"
         lines.append(
-            f'    {identity[c.source_node]} {_arrow(c)}|"{port_names(c)}<br/>{guarantee(c)}"| '
+            f'    {identity[c.source_node]} {arrow}|"{port_names(c)}<br/>{guarantee(c)}"| '
             f"{identity[c.destination_node]}"
         )
     topics: dict[str, str] = {}
@@ -60,13 +69,13 @@ def graph_mermaid(project: Project) -> str:
 
 
 def port_names(connection: Connection) -> str:
-    """The output and the input, or their common name; one that has none is left out."""
+    """The names of output and input, or their common name; an empty name is left out."""
     names = dict.fromkeys((connection.source_output, connection.destination_input))
     return " → ".join(name for name in names if name)
 
 
 def guarantee(connection: Connection) -> str:
-    """What a connection promises, in words."""
+    """The guarantee of a connection, in words."""
     if connection.discard_limit is None:
         words = "best effort"
     elif connection.discard_limit == 0:
@@ -76,15 +85,6 @@ def guarantee(connection: Connection) -> str:
     if connection.compression is not None:
         words += f", {connection.compression}"
     return words + (f", queue {connection.queue_size}" if connection.queue_size > 1 else "")
-
-
-def _node_lines(project: Project, node: Node) -> Iterator[str]:
-    yield f"{node.name}  ({node.container}, {node.plugin_name})"
-    ports = [*((port, "in ") for port in node.inputs), *((port, "out") for port in node.outputs)]
-    width = max((len(port.name) for port, _ in ports), default=0)
-    for port, side in ports:
-        yield f"  {side} {port.name:<{width}}  {port.type}"
-        yield from _ends(project, node, port, is_input=side == "in ")
 
 
 def _ends(project: Project, node: Node, port: Port, *, is_input: bool) -> Iterator[str]:
@@ -115,24 +115,16 @@ def _external(node: Node) -> Iterator[tuple[Port, bool]]:
         yield from ((port, is_input) for port in ports if port.external_topic is not None)
 
 
-def _arrow(connection: Connection) -> str:
-    if connection.discard_limit is None:
-        return "-.->"
-    return "==>" if connection.discard_limit == 0 else "-->"
-
-
 def _safe(text: str) -> str:
     return text.replace('"', "#quot;")
 
 
 # ---------------------------------------------------------------------- layout
 #
-# Layout of a project's graph: nodes in columns, connections from left to right.
-#
-# Nodes stand in every other column, so that each has those behind it to its right; loops are
-# broken where the search comes back. Connections have boxes of their own in the columns between,
-# and where one passes a column it has a place there, too: nothing is drawn over anything. Within
-# columns things are ordered by where their neighbours are (Sugiyama et al. 1981, barycentres).
+# Nodes stand in every other column, so that each has its receivers to its right; a connection that
+# closes a loop points back. Connections have boxes of their own in the columns between, and a place
+# in each column that they pass: nothing is drawn over anything. Within columns, things are ordered
+# by where their neighbours are (Sugiyama et al. 1981, barycentres).
 
 
 _SWEEPS = 6
@@ -140,7 +132,7 @@ _SWEEPS = 6
 
 @dataclass(frozen=True)
 class Place:
-    """Column from the left, row from the top (0.0 is the middle of the picture)."""
+    """Column from the left, row from the top; row 0.0 is the middle of the picture."""
 
     column: int
     row: float
@@ -148,11 +140,12 @@ class Place:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where things are.
+    """The places of a graph.
 
     Attributes:
-        nodes: by name; boxes: of connections, by name.
-        routes: of each connection, the places it goes through from sender to receiver.
+        nodes: by name.
+        boxes: of connections, by name.
+        routes: of each connection, its places from sender to receiver.
     """
 
     nodes: Mapping[str, Place]
@@ -161,10 +154,19 @@ class Layout:
 
 
 def lay_out(nodes: Sequence[str], connections: Mapping[str, Connection], first: str) -> Layout:
-    """Find places, with ``first`` in the left column if nothing leads to it but loops."""
+    """Lay out a graph, with ``first`` in the left column if only loops lead to it."""
     order = [first, *(node for node in nodes if node != first)]
     forward = _without_loops(order, connections)
-    layer = _layers(order, connections, forward)
+    layer = dict.fromkeys(order, 0)  # the longest way from the left
+    for _ in order:
+        before = dict(layer)
+        for name, c in connections.items():
+            ends = (c.source_node, c.destination_node)
+            left, right = ends if forward[name] else ends[::-1]
+            if left != right:
+                layer[right] = max(layer[right], layer[left] + 1)
+        if layer == before:
+            break
     columns: dict[int, list[str]] = {}
     links: list[tuple[str, str]] = []
     chains: dict[str, list[str]] = {}
@@ -194,9 +196,9 @@ def lay_out(nodes: Sequence[str], connections: Mapping[str, Connection], first: 
 
 
 def _without_loops(order: Sequence[str], connections: Mapping[str, Connection]) -> dict[str, bool]:
-    """Which connections lead forward, if those that lead back to where a search came from do not.
+    """Whether each connection leads forward, or back to a node that a depth-first search came from.
 
-    Depth first, without recursion: a project may be a chain of any length.
+    The search does not recurse: a project may be a chain of any length.
     """
     leaving: dict[str, list[tuple[str, str]]] = {node: [] for node in order}
     for name, c in connections.items():
@@ -220,24 +222,6 @@ def _without_loops(order: Sequence[str], connections: Mapping[str, Connection]) 
                 state[to] = "open"
                 stack.append((to, iter(leaving[to])))
     return forward
-
-
-def _layers(
-    order: Sequence[str], connections: Mapping[str, Connection], forward: Mapping[str, bool]
-) -> dict[str, int]:
-    """The longest way to each node from the left."""
-    layer = dict.fromkeys(order, 0)
-    for _ in order:
-        has_changed = False
-        for name, c in connections.items():
-            ends = (c.source_node, c.destination_node)
-            left, right = ends if forward[name] else ends[::-1]
-            if left != right and layer[right] <= layer[left]:
-                layer[right] = layer[left] + 1
-                has_changed = True
-        if not has_changed:
-            break
-    return layer
 
 
 def _order(columns: Mapping[int, list[str]], links: Sequence[tuple[str, str]]) -> dict[str, Place]:
@@ -265,7 +249,7 @@ def _centred(keys: Sequence[str]) -> dict[str, float]:
 
 # ---------------------------------------------------------------------- SVG
 #
-# A project as a picture for browsers and documents: SVG, made of text alone.
+# A project as a picture for browsers and documents.
 
 
 _PIXELS_PER_LETTER = 7.2
@@ -278,9 +262,17 @@ _TOPIC = "topic "
 
 
 def graph_svg(project: Project) -> str:
-    """The nodes, and between them the connections: thick lossless, dashed best effort."""
+    """The nodes, and between them the connections: thick lossless, dashed best effort.
+
+    External topics are drawn as nodes, with a connection to each of their ports.
+    """
     ends = {str(c): c for c in project.connections}
-    ends |= {str(c): c for c in _topic_ends(project, len(ends))}
+    for node in project.nodes:
+        for port, is_input in _external(node):
+            own, topic = (node.name, port.name), (f"{_TOPIC}{port.external_topic}", "")
+            sides = (*topic, *own) if is_input else (*own, *topic)
+            connection = Connection(*sides, index=len(ends))
+            ends[str(connection)] = connection
     names = [node.name for node in project.nodes]
     names += dict.fromkeys(
         name
@@ -292,17 +284,8 @@ def graph_svg(project: Project) -> str:
     return "\n".join(_Picture(project, names, ends, lay_out(names, ends, first)).lines()) + "\n"
 
 
-def _topic_ends(project: Project, index: int) -> Iterator[Connection]:
-    """External topics as what they are in the picture: ends of connections."""
-    ports = ((node, port, is_input) for node in project.nodes for port, is_input in _external(node))
-    for number, (node, port, is_input) in enumerate(ports, index):
-        own, topic = (node.name, port.name), (f"{_TOPIC}{port.external_topic}", "")
-        ends = (*topic, *own) if is_input else (*own, *topic)
-        yield Connection(*ends, index=number)
-
-
 class _Picture:
-    """One drawing; lengths are pixels."""
+    """A drawing; lengths are in pixels."""
 
     def __init__(
         self,
@@ -314,14 +297,22 @@ class _Picture:
         self._project, self._ends, self._layout = project, ends, layout
         self._texts: dict[Place, tuple[str, str]] = {}
         for name in names:
-            self._texts[layout.nodes[name]] = self._node_texts(name)
+            is_topic = name.startswith(_TOPIC)
+            container = "topic" if is_topic else project.node(name).container
+            self._texts[layout.nodes[name]] = (name.removeprefix(_TOPIC), container)
         for name, place in layout.boxes.items():
-            self._texts[place] = _connection_texts(ends[name])
+            c = ends[name]
+            is_topic = not (c.source_output and c.destination_input)
+            self._texts[place] = (port_names(c), "topic" if is_topic else guarantee(c))
         self._widths = {
             place: max(_LEAST_WIDTH, _PADDING + max(map(len, texts)) * _PIXELS_PER_LETTER)
             for place, texts in self._texts.items()
         }
-        self._left = self._columns()
+        # The left edge of each column, and of a further one.
+        self._left = [float(_MARGIN)]
+        for column in range(max(place.column for place in self._texts) + 1):
+            widths = [w for place, w in self._widths.items() if place.column == column]
+            self._left.append(self._left[-1] + max(widths, default=0.0) + _GAP)
         self._shifts = self._places_along_sides()
         rows = [place.row for route in layout.routes.values() for place in route]
         rows += [place.row for place in self._texts]
@@ -348,27 +339,13 @@ class _Picture:
             yield from self._box(place, "#ffffff" if is_topic else "#eaf1fa", _INK, 6)
         yield "</svg>"
 
-    def _node_texts(self, name: str) -> tuple[str, str]:
-        if name.startswith(_TOPIC):
-            return name.removeprefix(_TOPIC), "topic"
-        return name, self._project.node(name).container
-
-    def _columns(self) -> list[float]:
-        """Where each column begins, and after the last one where the next would."""
-        last = max(place.column for place in self._texts)
-        left = [float(_MARGIN)]
-        for column in range(last + 1):
-            widths = [w for place, w in self._widths.items() if place.column == column]
-            left.append(left[-1] + max(widths, default=0.0) + _GAP)
-        return left
-
     def _at(self, place: Place) -> tuple[float, float]:
         begin, end = self._left[place.column], self._left[place.column + 1] - _GAP
         y = (place.row - self._top) * _ROW + _HEIGHT / 2 + _MARGIN
         return (begin + end) / 2, y
 
     def _places_along_sides(self) -> dict[tuple[Place, Place], float]:
-        """How far from the middle of a node's side a line to a neighbour begins or ends."""
+        """By node and neighbour, how far from the middle of the node's side their line ends."""
         neighbours: dict[tuple[Place, bool], set[Place]] = {}
         for route in self._layout.routes.values():
             for node, other in ((route[0], route[1]), (route[-1], route[-2])):
@@ -395,7 +372,7 @@ class _Picture:
         yield f'<text x="{x:.1f}" y="{y + 15:.1f}" {style} font-size="12">{small}</text>'
 
     def _route(self, connection: Connection, route: Sequence[Place]) -> str:
-        """From the sender's side through the connection's box to the receiver's."""
+        """The line of a connection."""
         parts = []
         for a, b in itertools.pairwise(route):
             (x, y), (to_x, to_y) = self._at(a), self._at(b)
@@ -415,11 +392,6 @@ class _Picture:
             f'<path d="{"".join(parts)}" fill="none" stroke="{colour}" stroke-width="{width}"'
             f'{dashes} marker-end="url(#{_marker_name(colour)})"/>'
         )
-
-
-def _connection_texts(connection: Connection) -> tuple[str, str]:
-    is_topic = not (connection.source_output and connection.destination_input)
-    return port_names(connection), "topic" if is_topic else guarantee(connection)
 
 
 def _marker(colour: str) -> str:

@@ -56,15 +56,14 @@ _T = TypeVar("_T")
 _OWN_VARIABLES = frozenset(
     f"NEUROS_{name}" for name in ("RUN_ID", "RUN_DIR", "CONTROL", "ELSEWHERE", "GUARDED_RUN")
 )
-"""Variables by which the processes of a run find each other, and the reaper finds them."""
+"""Variables by which the processes of a run, and the reaper, find each other."""
 
 
 class _Builder:
-    """Builds nodes, as far as they have the right form.
+    """Builds nodes, also of files with problems.
 
     Attributes:
-        problems: what was found on the way: missing files, unknown types. What they concern is
-            left out of the nodes, which are of no use then.
+        problems: missing files and unknown types; the nodes lack them.
     """
 
     def __init__(self, parsed: ParsedProject) -> None:
@@ -82,8 +81,17 @@ class _Builder:
                 text = f"'{name}' is set by NeuROS itself: remove it"
                 self.problems.append(member.key_problem(text))
                 continue
-            environment[name], is_path = self._variable(member)
-            if is_path:
+            value = member.value
+            is_text = isinstance(value, str) and value[:1] in ("#", "@") and "\0" not in value
+            if not is_text:
+                is_number = isinstance(value, bool | int | float)
+                environment[name] = member.text if is_number else str(value)
+            elif value[:2] in ("##", "@@"):
+                environment[name] = value[1:]
+            else:
+                advice = f"write '{value[0]}{value}' if it is not a path"
+                found = self._find(member, folder_allowed=True, advice=advice)
+                environment[name] = str(found or "")
                 paths.append(name)
         keys, cores = element.plain, (core.value for core in element.items("affinity"))
         module, plugin = self._plugin(element)
@@ -111,7 +119,7 @@ class _Builder:
         )
 
     def _plugin(self, element: Element) -> tuple[str, Path]:
-        """The plugin's module, empty where a file is named, and its file; a file comes first."""
+        """The module of the plugin, empty if a file has that name, and its file."""
         member, name = element.member("plugin"), element.string("plugin") or ""
         if member is None or not is_module_name(name):
             return "", self._file(element, "plugin") or Path()
@@ -125,7 +133,7 @@ class _Builder:
         return name, path or Path()
 
     def _is_like_this_machine(self, node: Element) -> bool:
-        """Whether the node's container has what this machine has."""
+        """Whether the node's container has the packages of this machine."""
         container = container_in_place_of(node.string("container") or "")
         return container.partition(":")[0] in STANDARD_CONTAINERS
 
@@ -143,18 +151,6 @@ class _Builder:
         except PathError as error:
             self.problems.append(member.problem(error.text, error.hint or advice))
             return None
-
-    def _variable(self, member: Element) -> tuple[str, bool]:
-        """The value of an environment variable, and whether it is a path."""
-        value = member.value
-        if isinstance(value, bool | int | float):
-            return member.text, False
-        if not isinstance(value, str) or value[:1] not in ("#", "@") or "\0" in value:
-            return str(value), False
-        if value[:2] in ("##", "@@"):
-            return value[1:], False
-        advice = f"write '{value[0]}{value}' if it is not a path"
-        return str(self._find(member, folder_allowed=True, advice=advice) or ""), True
 
     def _ports(self, node: Element, side: str) -> tuple[Port, ...]:
         must_be_here = self._is_like_this_machine(node)
@@ -185,7 +181,7 @@ class _Builder:
 
 
 def _if_valid(read: Callable[[], _T], default: _T) -> _T:
-    """What ``read`` returns; ``default`` where the value is invalid, as the schema reports."""
+    """The result of ``read``; ``default`` for an invalid value, which the schema reports."""
     try:
         return read()
     except (AttributeError, KeyError, IndexError, TypeError, ValueError, OverflowError):
@@ -215,19 +211,21 @@ def load_project(
 
     Args:
         path: the project file, or a folder that holds ``project.json``.
-        workspace: the folder that ``@path`` starts from, after the project's own.
+        workspace: the second folder of ``@path``, after the project's own workspace.
         overrides: the texts of ``--set``, applied in this order.
-        folder: the project's folder, if it is not the one of the file: the expanded project of
-            a run lies in the folder of the run.
+        folder: the project's folder, if not that of the file: the expanded project of a run is in
+            the folder of the run.
         packages: message packages of workspaces.
-        namespace: the text of ``--namespace``, in the place of the project's own.
-        remap: the texts of ``--remap``; they go before the project's own rules.
-        reads_plugins: whether to look into plugins, too, which are not run.
+        namespace: the text of ``--namespace``; it replaces the project's own.
+        remap: the texts of ``--remap``; they come before the project's own rules.
+        reads_plugins: whether to check the sources of plugins, too.
 
     Raises:
-        ProjectError: with every problem there is.
+        ProjectError: with all problems.
     """
-    file = _project_file(path)
+    file = path.resolve() / PROJECT_FILE if path.is_dir() else path.parent.resolve() / path.name
+    if problem := _no_project_at(path, file):
+        raise ProjectError([problem])
     roots = Roots((folder or file.parent).resolve(), workspace.resolve(), packages)
     try:
         parsed = parse_project(file, roots)
@@ -256,50 +254,40 @@ def load_project(
         raise ProjectError(problems)
     if reads_plugins:
         doubts += unread_variables(parsed, nodes, overrides)
+    element = parsed.root.member("budgets")
+    budgets: dict[str, Any] = {} if element is None else element.plain
+    lost = {name: int(most) for name, most in budgets.get("lost_packets", {}).items()}
     project = Project(
         name=_name(roots.project, file),
         nodes=nodes,
         connections=connections,
         file=roots.project / file.name,
         description=parsed.root.string("description") or "",
-        budgets=_budgets_of(parsed),
+        budgets=Budgets(**{**budgets, "lost_packets": lost}),
         names=names,
         dashboard=dashboard_of(parsed),
     )
     return Loaded(project, (*remarks(parsed), *doubts))
 
 
-def _project_file(path: Path) -> Path:
-    """The project file, by its absolute path (the file itself may be a symbolic link)."""
-    if path.is_dir():
-        file = path.resolve() / PROJECT_FILE
-        if not file.is_file():
-            text = f"the folder '{path}' has no {PROJECT_FILE}"
-            others = sorted(other.name for other in path.glob("*.json"))
-            hint = f"it has {', '.join(others)}" if others else ""
-            raise ProjectError([Problem(display_name(file), 0, 0, "", text, hint)])
-        return file
-    file = path.parent.resolve() / path.name
+def _no_project_at(path: Path, file: Path) -> Problem | None:
+    """Why ``file`` cannot be the project file of the path that the user gave."""
+    name = display_name(file)
+    if path.is_dir() and not file.is_file():
+        others = sorted(other.name for other in path.glob("*.json"))
+        hint = f"it has {', '.join(others)}" if others else ""
+        return Problem(name, 0, 0, "", f"the folder '{path}' has no {PROJECT_FILE}", hint)
     if not file.exists():
         names = (entry.name for entry in file.parent.glob("*"))
         hint = did_you_mean(file.name, names) or f"the current folder is {Path.cwd()}"
-        problem = Problem(display_name(file), 0, 0, "", "there is no such file", hint)
-        raise ProjectError([problem])
+        return Problem(name, 0, 0, "", "there is no such file", hint)
     if file.suffix == ".py":
-        text, hint = "is a plugin, not a project", f"name its {PROJECT_FILE}, or their folder"
-        raise ProjectError([Problem(display_name(file), 1, 1, "/", text, hint)])
-    return file
+        hint = f"name its {PROJECT_FILE}, or their folder"
+        return Problem(name, 1, 1, "/", "is a plugin, not a project", hint)
+    return None
 
 
 def _name(folder: Path, file: Path) -> str:
-    """What a run of the project is called: the folder, and the file where it is a variant."""
+    """The project's name: that of the folder, with that of the file if it is a variant."""
     name = folder.name or "project"
     return name if file.name == PROJECT_FILE else f"{name}-{file.stem}"
-
-
-def _budgets_of(parsed: ParsedProject) -> Budgets:
-    """The budgets of a valid project."""
-    element = parsed.root.member("budgets")
-    values: dict[str, Any] = {} if element is None else element.plain
-    lost = {name: int(most) for name, most in values.get("lost_packets", {}).items()}
-    return Budgets(**{**values, "lost_packets": lost})

@@ -1,8 +1,8 @@
-"""Loops of a project: who starts each, as far as plugins tell without being run.
+"""Loops of a project: which hooks start each, as far as the sources of plugins tell.
 
-A hook can run if its required inputs get packets; an output gets them from a hook that can run. So
-what can run is found from the hooks that need nothing: ticks, initialise hooks, main loops. Of a
-plugin that computes its hooks, or that sends from a thread, anything may come.
+A hook can run if a hook that can run sends to each of its required inputs. The search begins with
+the hooks that need no packet: ticks, initialise hooks, main loops. A plugin that computes its
+hooks, or sends from a thread, may send anything.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Loop:
     """Nodes that send to each other.
 
     Attributes:
-        started_by: the hooks that send there without having received from there, in words; empty
-            if that is nobody, ``None`` if it is not known.
-        may_stop_at: its connections that may lose the packet for which all of it waits.
+        started_by: in words, the hooks that send into the loop without a packet from it;
+            ``None`` if unknown.
+        may_stop_at: its connections that may lose the packet for which the whole loop waits.
     """
 
     nodes: tuple[str, ...]
@@ -55,7 +55,7 @@ class _Hook(NamedTuple):
 
     @property
     def needed(self) -> list[DeclaredPort]:
-        """The inputs without which it does not start."""
+        """The required inputs."""
         return [port for port in self.declared.inputs or () if not port.is_optional]
 
     @property
@@ -64,7 +64,7 @@ class _Hook(NamedTuple):
 
 
 class Loops:
-    """What can run in a project, and in which of its loops nothing can."""
+    """The hooks of a project that can run, and its loops."""
 
     def __init__(self, project: Project) -> None:
         self._nodes = {node.name: node for node in project.nodes}
@@ -76,9 +76,8 @@ class Loops:
         to: dict[str, set[str]] = {}
         for each in project.connections:
             to.setdefault(each.source_node, set()).add(each.destination_node)
-        self._takers = to
         self._rings = _rings([*self._nodes], lambda name: to.get(name, ()))
-        # Without a loop nothing is to be told of the hooks, and no plugin need be read.
+        # Without a loop no plugin need be read.
         hooks = {node.name: _hooks_of(node) if self._rings else () for node in project.nodes}
         self._unknown = {name for name, found in hooks.items() if found is None}
         self._hooks = {
@@ -87,20 +86,33 @@ class Loops:
         }
         self._live: set[tuple[str, str]] = set()
         self._running: set[_Hook] = set()
-        self._find_running()
+        waiting = [hook for each in self._hooks.values() for hook in each]
+        while waiting:
+            hook = waiting.pop()
+            if hook in self._running or any(self._lacks(hook.node, p) for p in self._needs(hook)):
+                continue
+            self._running.add(hook)
+            self._live |= {(hook.node, output) for output in hook.outputs}
+            waiting += [each for node in to.get(hook.node, ()) for each in self._hooks[node]]
 
     @cached_property
     def found(self) -> tuple[Loop, ...]:
         """All loops of the project."""
-        return tuple(
-            Loop(tuple(ring), self._starters({*ring}), self._losers({*ring}))
-            for ring in self._rings
-        )
+        return tuple(self._loop(ring) for ring in self._rings)
 
     def problems(self) -> Iterator[Problem]:
-        """The loops in which every hook waits for another one."""
+        """The loops in which every hook waits for another hook of the loop."""
         dead = [hook for each in self._hooks.values() for hook in each if hook not in self._running]
-        before = {hook: [*self._awaited(hook, {*dead})] for hook in dead}
+        before = {
+            hook: [
+                (other, port)
+                for port in self._needs(hook)
+                for connection in self._lacks(hook.node, port)
+                for other in self._hooks[connection.source_node]
+                if other not in self._running and connection.source_output in other.outputs
+            ]
+            for hook in dead
+        }
         for ring in _rings(dead, lambda hook: [other for other, _ in before[hook]]):
             first = ring[0]
             waits = [f"'{hook.declared.name}' of {hook.node}" for hook in ring]
@@ -108,8 +120,9 @@ class Loops:
             sends = sorted(
                 c.source_output
                 for c in self._connections
-                if c.source_node == first.node and c.source_output in first.outputs
-                if any(hook.node == c.destination_node for hook in ring)
+                if c.source_node == first.node
+                and c.source_output in first.outputs
+                and any(hook.node == c.destination_node for hook in ring)
             )
             plugin = self._nodes[first.node].plugin
             outputs = ", ".join(f'"{name}"' for name in dict.fromkeys(sends))
@@ -126,18 +139,6 @@ class Loops:
 
     # ------------------------------------------------------------------ inside
 
-    def _find_running(self) -> None:
-        waiting = [hook for hooks in self._hooks.values() for hook in hooks]
-        while waiting:
-            hook = waiting.pop()
-            if hook in self._running or any(self._lacks(hook.node, p) for p in self._needs(hook)):
-                continue
-            self._running.add(hook)
-            self._live |= {(hook.node, output) for output in hook.outputs}
-            waiting += [
-                each for node in self._takers.get(hook.node, ()) for each in self._hooks[node]
-            ]
-
     def _needs(self, hook: _Hook) -> list[DeclaredPort]:
         clock = self._nodes[hook.node].clock
         if hook.declared.sim_tick is None or clock is None:
@@ -145,7 +146,7 @@ class Loops:
         return [*hook.needed, DeclaredPort(clock.name, *hook.declared.sim_tick)]
 
     def _lacks(self, node: str, port: DeclaredPort) -> list[Connection]:
-        """The connections that bring nothing, if therefore an input has no packet."""
+        """The connections of an input that bring nothing, if the input gets no packet therefore."""
         ends = self._to.get((node, port.name or ""), [])
         silent = [
             each
@@ -155,58 +156,44 @@ class Loops:
         ]
         return silent if port.is_all or len(silent) == len(ends) else []
 
-    def _awaited(self, hook: _Hook, dead: set[_Hook]) -> Iterator[tuple[_Hook, DeclaredPort]]:
-        for port in self._needs(hook):
-            for connection in self._lacks(hook.node, port):
-                for other in self._hooks[connection.source_node]:
-                    if other in dead and connection.source_output in other.outputs:
-                        yield other, port
-
-    def _starters(self, ring: set[str]) -> tuple[str, ...] | None:
-        found = tuple(
-            f"{_KINDS[hook.declared.kind]} '{hook.declared.name}' of {hook.node}"
-            for hook in self._starting(ring)
-        )
-        return found or (None if ring & self._unknown else ())
-
-    def _starting(self, ring: set[str]) -> list[_Hook]:
-        """The hooks that send into a ring without having received from it."""
-        inside = self._inside(ring)
+    def _loop(self, nodes: Sequence[str]) -> Loop:
+        ring = {*nodes}
+        inside = [c for c in self._connections if {c.source_node, c.destination_node} <= ring]
         sent = {(c.source_node, c.source_output) for c in inside}
-        taken = {(c.destination_node, c.destination_input) for c in inside}
-        return [
+        received = {(c.destination_node, c.destination_input) for c in inside}
+        starting = [
             hook
             for node in sorted(ring)
             for hook in self._hooks[node]
             if hook in self._running
             and any((node, output) in sent for output in hook.outputs)
-            and not any((node, port.name) in taken for port in self._needs(hook))
+            and not any((node, port.name) in received for port in self._needs(hook))
         ]
-
-    def _losers(self, ring: set[str]) -> tuple[str, ...]:
-        """Where a loss ends a ring: in one that only initialise hooks start, once."""
-        kinds = {hook.declared.kind for hook in self._starting(ring)}
-        if ring & self._unknown or kinds != {"neuros_initialise"}:
-            return ()
-        return tuple(
+        started_by = tuple(
+            f"{_KINDS[hook.declared.kind]} '{hook.declared.name}' of {hook.node}"
+            for hook in starting
+        )
+        is_known = not ring & self._unknown
+        # Initialise hooks start a loop once: a lost packet ends it.
+        starts_once = {hook.declared.kind for hook in starting} == {"neuros_initialise"}
+        may_stop_at = tuple(
             str(c)
-            for c in self._inside(ring)
+            for c in inside
+            if is_known and starts_once
             if not c.is_reliable and c.source_node != c.destination_node
         )
-
-    def _inside(self, ring: set[str]) -> list[Connection]:
-        return [c for c in self._connections if {c.source_node, c.destination_node} <= ring]
+        return Loop(tuple(nodes), started_by or (() if is_known else None), may_stop_at)
 
 
 def _hooks_of(node: Node) -> Sequence[DeclaredHook] | None:
-    """The hooks of a node; ``None`` where others may be there, or packets come without them."""
+    """The hooks of a node; ``None`` if it may have others, or sends packets without hooks."""
     plugin = None if node.plugin.name == "" else read_plugin(node.plugin)
     if plugin is None or not plugin.is_whole or plugin.mistakes:
         return None
     beside = [*modules_beside(plugin)]
     if any(part.sends_by_itself for part in (plugin, *beside)):
         return None
-    bring_hooks = plugin.functions_of - {_name_of(p) for p in beside if p.is_whole and not p.hooks}
+    bring_hooks = plugin.functions_of - {p.path.stem for p in beside if p.is_whole and not p.hooks}
     is_known = all(None not in (hook.inputs, hook.outputs) for hook in plugin.hooks)
     has_names = all(
         port.name is not None
@@ -214,10 +201,6 @@ def _hooks_of(node: Node) -> Sequence[DeclaredHook] | None:
         for port in (*(hook.inputs or ()), *(hook.outputs or ()))
     )
     return plugin.hooks if is_known and has_names and not bring_hooks else None
-
-
-def _name_of(plugin: PluginFile) -> str:
-    return plugin.path.stem
 
 
 def modules_beside(plugin: PluginFile) -> Iterator[PluginFile]:
@@ -228,7 +211,7 @@ def modules_beside(plugin: PluginFile) -> Iterator[PluginFile]:
 
 
 def _rings(keys: Iterable[_Key], after: Callable[[_Key], Iterable[_Key]]) -> list[list[_Key]]:
-    """The strongly connected components with a circle in them, in the order of ``keys``."""
+    """The strongly connected components that have a circle, in the order of ``keys`` (Kosaraju)."""
     order = [*keys]
     forward: Mapping[_Key, list[_Key]] = {key: [*after(key)] for key in order}
     backward: dict[_Key, list[_Key]] = {key: [] for key in order}

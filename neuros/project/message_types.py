@@ -1,8 +1,8 @@
 """Message types: their notation, and whether they exist on this machine.
 
-Importing a message package costs tens of milliseconds. To see whether it has a message it is
-enough to find the package and to look at the names that its ``msg`` package imports; only where
-that list does not have the name (packages may build it in other ways) is it really imported.
+The import of a message package takes tens of milliseconds. So a message is searched among the names
+that ``msg/__init__.py`` of its package imports. The package is imported only if the name is not
+there: a package may define its messages in other ways.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class MessageField:
     """A field, or an element of one.
 
     Attributes:
-        type: of it, or of each of its elements: ``double``, ``geometry_msgs/msg/Vector3``.
-        is_array: whether it has elements.
+        type: of the value, or of each element: ``double``, ``geometry_msgs/msg/Vector3``.
+        is_array: whether the field has elements.
     """
 
     type: str
@@ -37,12 +37,12 @@ class MessageField:
 
     @property
     def is_message(self) -> bool:
-        """Whether it is a message, which has fields of its own."""
+        """Whether the field is a message, with fields of its own."""
         return "/" in self.type and not self.is_array
 
     @property
     def has_numbers(self) -> bool:
-        """Whether it is a number, or an array of numbers; true and false are numbers, too."""
+        """Whether the field is a number, a truth value, or an array of these."""
         return "/" not in self.type and self.type not in _TEXTS
 
     def __str__(self) -> str:
@@ -50,20 +50,20 @@ class MessageField:
 
 
 class MessagePackages(Protocol):
-    """Message packages that a project brings, or shares: they need not be built yet."""
+    """Message packages of the project or its workspace; they need not be built yet."""
 
     def messages(self, package: str) -> Collection[str] | None:
-        """The names of its messages, ``None`` if there is no such package."""
+        """The names of a package's messages, ``None`` if there is no such package."""
 
     def installed(self, package: str) -> Path | None:
-        """The folder that it is, or will be, built into, ``None`` if there is no such package."""
+        """The folder of the built package, ``None`` if there is no such package."""
 
     def fields(self, package: str, name: str) -> Mapping[str, MessageField] | None:
-        """The fields of a message, ``None`` if there is none, or its file is wrong."""
+        """The fields of a message, ``None`` if it is missing or its file is wrong."""
 
 
 class NoPackages:
-    """There are none (:class:`MessagePackages`)."""
+    """:class:`MessagePackages` without any package."""
 
     def messages(self, package: str) -> None:
         return None
@@ -87,11 +87,11 @@ def normalised(text: str) -> str | None:
 def unknown_type(
     type_name: str, *, must_be_here: bool, packages: MessagePackages = NO_PACKAGES
 ) -> tuple[str, str] | None:
-    """What is wrong with a normalised type, and a hint; ``None`` if nothing is, or it is not known.
+    """The problem of a normalised type, and a hint; ``None`` if it exists, or may exist.
 
     Args:
-        must_be_here: whether it is wrong too if its package is not installed on this machine.
-        packages: those that are built for the project.
+        must_be_here: whether a package that is not installed on this machine is a problem.
+        packages: of the project.
     """
     package, _, name = type_name.split("/")
     folder = message_folder(package)
@@ -101,9 +101,17 @@ def unknown_type(
     if folder is None:
         if not must_be_here:
             return None
+        # Most names end in _msgs, which would make all of them similar.
+        ending = "_msgs" if package.endswith("_msgs") else ""
+        others = {
+            init.parents[1].name.removesuffix(ending)
+            for path in sys.path
+            for init in Path(path).glob(f"*{ending or '_*'}/msg/__init__.py")
+        }
+        similar = did_you_mean(package.removesuffix(ending), others).replace("'?", f"{ending}'?")
         return (
             f"unknown message type '{type_name}': there is no message package '{package}' here",
-            _similar_package(package)
+            similar
             or f"a message of your own is workspace/{package}/msg/{name}.msg beside the project"
             f" file, with workspace/{package}/package.xml: docs/messages.md",
         )
@@ -140,29 +148,10 @@ def imported(package: str, name: str) -> Any:
         return None
 
 
-def _similar_package(package: str) -> str:
-    """Whether another one is meant; nearly all end alike, which makes none of them similar."""
-    ending = "_msgs" if package.endswith("_msgs") else ""
-    names = {name.removesuffix(ending) for name in _installed_packages() if name.endswith(ending)}
-    return did_you_mean(package.removesuffix(ending), names).replace("'?", f"{ending}'?")
-
-
-def _installed_packages() -> set[str]:
-    folders = [Path(entry) for entry in sys.path if Path(entry).is_dir()]
-    return {
-        package.name
-        for folder in folders
-        for package in folder.glob("*_*")
-        if (package / "msg" / "__init__.py").is_file()
-    }
-
-
 # ---------------------------------------------------------------------- fields
 #
-# Paths of fields, such as ``angular_velocity.z`` or ``ranges[0]``: what they lead to in a message.
-#
-# The fields of an installed message come from its class. Those of a message package of the
-# project, which need not be built yet, come from its ``.msg`` file, which rosidl's parser reads.
+# The fields of an installed message come from its class. The fields of a message of the project,
+# which need not be built yet, come from its ``.msg`` file, which rosidl's parser reads.
 
 
 _PATH = re.compile(r"[A-Za-z_]\w*(\[\d+\])*(\.[A-Za-z_]\w*(\[\d+\])*)*", re.ASCII)
@@ -171,12 +160,7 @@ _OF_CLASS = re.compile(r"(sequence<)?([\w/]+)(?:<\d+>)?(?:, \d+)?>?(?:\[(\d+)\])
 
 
 def fields_of(type_name: str, packages: MessagePackages) -> Mapping[str, MessageField] | None:
-    """The fields of a message type by name; ``None`` where its definition is not on this machine.
-
-    Args:
-        type_name: as ``sensor_msgs/msg/Imu``.
-        packages: those that are built for the project.
-    """
+    """The fields of a message type, by name; ``None`` if its definition is not on this machine."""
     package, _, name = type_name.split("/")
     own = packages.fields(package, name)
     if own is not None:
@@ -185,11 +169,16 @@ def fields_of(type_name: str, packages: MessagePackages) -> Mapping[str, Message
     if message is None:
         return None
     types: Mapping[str, str] = message.get_fields_and_field_types()
-    return {key: _of_class(text) for key, text in types.items()}
+    fields = {}
+    for key, text in types.items():
+        is_sequence, element, size = parts_of_type(text)
+        written = "/msg/".join(element.split("/"))
+        fields[key] = MessageField(written, is_array=bool(is_sequence or size))
+    return fields
 
 
 def parts_of_type(text: str) -> tuple[bool, str, str]:
-    """Of a type as classes have it: whether it is a sequence, of what, and the size of an array.
+    """Whether a type in a message class is a sequence, its element, and the size of an array.
 
     ``sequence<geometry_msgs/Point, 3>`` is ``(True, "geometry_msgs/Point", "")``.
     """
@@ -198,22 +187,15 @@ def parts_of_type(text: str) -> tuple[bool, str, str]:
     return bool(found[1]), found[2], found[3] or ""
 
 
-def _of_class(text: str) -> MessageField:
-    is_sequence, element, size = parts_of_type(text)
-    package, _, name = element.rpartition("/")
-    written = f"{package}/msg/{name}" if package else name
-    return MessageField(written, is_array=bool(is_sequence or size))
-
-
 def misfit(
     type_name: str, path: str, packages: MessagePackages, *, wants_array: bool
 ) -> tuple[str, str] | None:
-    """What is wrong with the path of a field, and a hint; ``None`` if nothing is, or it is unknown.
+    """The problem with the path of a field, and a hint; ``None`` if it is right, or may be.
 
     Args:
         type_name: of the message, as ``sensor_msgs/msg/Imu``.
         path: as ``angular_velocity.z`` or ``ranges[0]``.
-        wants_array: whether it has to lead to an array of numbers; else it must be to one number.
+        wants_array: whether the path must lead to an array of numbers, in place of a number.
     """
     if not _PATH.fullmatch(path):
         return f"'{path}' is not the path of a field", "write it as 'angular_velocity.z'"
@@ -238,12 +220,8 @@ def misfit(
     if here.has_numbers and here.is_array == wants_array:
         return None
     wanted = "an array of numbers" if wants_array else "a number"
-    return f"'{path}' of {type_name} is {here}, not {wanted}", _instead(here, done, packages)
-
-
-def _instead(here: MessageField, path: str, packages: MessagePackages) -> str:
-    """How to go on from a path that ends too early."""
+    hint = f"name an element, as '{done}[0]'" if here.is_array else ""
     if here.is_message:
-        fields = fields_of(here.type, packages) or {}
-        return f"name one of its fields: {listed(f'{path}.{each}' for each in fields)}"
-    return f"name an element, as '{path}[0]'" if here.is_array else ""
+        parts = fields_of(here.type, packages) or {}
+        hint = f"name one of its fields: {listed(f'{done}.{each}' for each in parts)}"
+    return f"'{path}' of {type_name} is {here}, not {wanted}", hint

@@ -1,7 +1,7 @@
-"""A project as data: what the files say, resolved and checked, and nothing that runs.
+"""A project as frozen data, resolved and checked.
 
-Everything here is frozen. :mod:`neuros.project.load` reads it from files,
-:mod:`neuros.project.split` cuts it into one :class:`NodeFile` per node.
+:mod:`neuros.project.load` builds it from files, :mod:`neuros.project.split` cuts it into one
+:class:`NodeFile` per node.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from neuros.project.names import INTERNAL, Names
 from neuros.project.qos import Qos
 
 Value: TypeAlias = "bool | int | float | str | tuple[bool | int | float | str, ...]"
-"""What a ROS parameter holds here."""
+"""The value of a ROS parameter."""
 
 NETWORK_MODULE = "neuros.snn.nir.plugin"
 """The plugin of nodes with ``"network"``; the file is in the variable :data:`NETWORK`."""
@@ -36,9 +36,9 @@ class Resources:
     """Limits of a node; ``None`` is no limit of its own.
 
     Attributes:
-        mem_bytes: memory; what needs more is killed.
-        cpus: cores' worth of computing time, 1.5 is one and a half.
-        pids: processes and threads at any one time.
+        mem_bytes: memory; the kernel kills a node that needs more.
+        cpus: computing time, in cores: 1.5 is one and a half.
+        pids: processes and threads at a time.
     """
 
     mem_bytes: int | None = None
@@ -48,7 +48,7 @@ class Resources:
 
 @dataclass(frozen=True)
 class Access:
-    """What a container is let in to that it would not see by itself.
+    """Devices of the machine that a container may use.
 
     Attributes:
         devices: paths in ``/dev``.
@@ -70,9 +70,9 @@ class Port:
         type: message type in ROS notation, ``"std_msgs/msg/String"``.
         external_topic: the plain ROS topic that it is bound to, as written, or ``None``;
             :meth:`Names.resolve` tells its full name.
-        qos: what is offered or asked for there, or ``None`` where the file does not say.
-        mujoco: the sensor or actuator behind it as the node file declares it, empty if none.
-        gazebo_type: kept from published project files; it has no effect.
+        qos: of the external topic, or ``None`` if the file has none.
+        mujoco: the sensor or actuator of the port, as the node file declares it; empty if none.
+        gazebo_type: of published project files; it has no effect.
     """
 
     name: str
@@ -88,18 +88,19 @@ class Node:
     """One plugin in one container.
 
     Attributes:
-        plugin: absolute path of the Python file with the hooks; ``Path()`` where it is in a module
-            that this Python does not have.
+        plugin: absolute path of the Python file with the hooks; ``Path()`` for a module that is
+            not installed on this machine.
         script: absolute path of a shell script that runs before the node, or ``None``.
         environment: environment variables, with ``#path`` and ``@path`` already resolved.
-        file: the file that describes the node, for messages; ``pointer`` is its place in there.
-        environment_paths: names of the environment variables that are such paths, sorted.
-        affinity: numbers of the cores that it is to run on, from 0; empty if it does not matter.
-        resources: what it may use at most.
-        access: what its container is let in to.
+        file: the file that describes the node, for messages.
+        pointer: the JSON pointer of the node in ``file``.
+        environment_paths: sorted names of the variables that hold such paths.
+        affinity: numbers of the cores that the node runs on, from 0; empty: any core.
+        resources: its limits.
+        access: devices that its container may use.
         parameters: values of ROS parameters, by full name.
-        module: the name of the plugin where it is one of an installed package, else empty.
-        finalise_s: how long it may finalise without progress before it is killed, in seconds.
+        module: the plugin as a module of an installed package, else empty.
+        finalise_s: seconds of finalisation without progress after which the node is killed.
     """
 
     name: str
@@ -129,7 +130,7 @@ class Node:
 
     @property
     def plugin_name(self) -> str:
-        """What to call the plugin, or the network in its place."""
+        """The name of the plugin, or of the network in its place, for messages."""
         if self.module == NETWORK_MODULE:
             return Path(self.environment.get(NETWORK, "")).name
         return self.module or self.plugin.name
@@ -143,7 +144,7 @@ class Node:
 
     @property
     def clock(self) -> Port | None:
-        """The input that brings simulated time: that of type Clock; of several, ``clock``."""
+        """The input of type Clock, which brings simulated time; of several, the input ``clock``."""
         clocks = [port for port in self.inputs if port.type == CLOCK_TYPE]
         if len(clocks) > 1:
             clocks = [port for port in clocks if port.name == "clock"]
@@ -151,7 +152,7 @@ class Node:
 
     @property
     def no_clock(self) -> tuple[str, str]:
-        """What is wrong where a hook needs a clock and the node has none, and what to do."""
+        """The error of a hook that needs a clock in a node without one, and a hint."""
         clocks = [port.name for port in self.inputs if port.type == CLOCK_TYPE]
         has = "several inputs" if clocks else "no input"
         text = f"ticks by simulated time, but node '{self.name}' has {has} of type {CLOCK_TYPE}"
@@ -169,7 +170,7 @@ class Connection:
         queue_size: unread packets that the receiver holds, K.
         index: its place in the project file, from 0; the order of the packets of an ``All`` input.
         namespace: that of the project, empty or as in ``/left``.
-        compression: ``zstd`` for packets that leave the machine, ``jpeg``; ``None``: there is none.
+        compression: ``zstd`` (of packets that leave the machine), ``jpeg`` or ``None``.
         quality: of JPEG, 1 to 100.
     """
 
@@ -186,7 +187,7 @@ class Connection:
 
     @property
     def is_reliable(self) -> bool:
-        """Whether it has a discard limit, and so acknowledgements."""
+        """Whether the connection has a discard limit, and so acknowledgements."""
         return self.discard_limit is not None
 
     @property
@@ -196,7 +197,7 @@ class Connection:
 
     @property
     def is_jpeg(self) -> bool:
-        """Whether its packets are images that are encoded as JPEG."""
+        """Whether packets are images, encoded as JPEG."""
         return self.compression == "jpeg"
 
     @property
@@ -214,7 +215,7 @@ class Connection:
 
     @classmethod
     def of(cls, keys: Mapping[str, Any], **more: Any) -> Connection:
-        """The connection that valid keys describe; JSON may write a whole number as ``2.0``."""
+        """The connection of valid keys; JSON may write a whole number as ``2.0``."""
         flat = {**keys, **keys.get("transport", {})}
         flat.pop("transport", None)
         whole: dict[str, Any] = {k: int(v) if isinstance(v, float) else v for k, v in flat.items()}
@@ -222,7 +223,7 @@ class Connection:
 
     @property
     def keys(self) -> dict[str, Any]:
-        """As a project file has it."""
+        """The keys in a project file."""
         values = {f.name: (getattr(self, f.name), f.default) for f in fields(self)}
         del values["index"], values["namespace"]
         keys = {key: value for key, (value, default) in values.items() if value != default}
@@ -230,7 +231,7 @@ class Connection:
         return {**keys, "transport": transport} if transport else keys
 
     def __hash__(self) -> int:
-        # Looked up for every packet; the place in the project tells most connections apart.
+        # Every packet looks its connection up; the index differs between most connections.
         return hash(self.index)
 
     def __str__(self) -> str:
@@ -242,7 +243,7 @@ class Connection:
 
 @dataclass(frozen=True)
 class Folders:
-    """The folders that a node may read (project, workspace) and write (run), as it sees them."""
+    """Paths in a node of the folders that it may read (project, workspace) and write (run)."""
 
     project: Path
     workspace: Path
@@ -251,14 +252,13 @@ class Folders:
 
 @dataclass(frozen=True)
 class NodeFile:
-    """The content of ``node.json``: a node and its own connections, nothing else.
+    """The content of ``node.json``: a node and its own connections.
 
     Attributes:
         index: the node's place in the project file, from 0.
-        messages: where Python finds the message packages of workspaces, a folder for each: it is
-            called ``python``, and lies in that of the built package.
+        messages: for ``sys.path``, the folder ``python`` of each built message package.
         names: the project's.
-        list_bytes: so much each list of its packet log has at most; 0: it keeps none.
+        list_bytes: limit of each list of the packet log; 0: the node keeps no log.
     """
 
     node: Node
@@ -272,12 +272,12 @@ class NodeFile:
 
 @dataclass(frozen=True)
 class Budgets:
-    """What must hold of every run; a run that breaks one ends with exit code 5.
+    """Limits of every run; a run that breaks one ends with exit code 5.
 
     Attributes:
-        lost_packets: by connection (``a.out -> b.in``), how many may be lost or discarded in all.
-        real_time_factor: at least this much.
-        tick_error_ms: how far an interval of a timed hook may be off its period.
+        lost_packets: most packets lost or discarded, by connection (``a.out -> b.in``).
+        real_time_factor: the least.
+        tick_error_ms: the largest difference between an interval of a timed hook and its period.
     """
 
     lost_packets: Mapping[str, int] = field(default_factory=lambda: _NOTHING, hash=False)
@@ -287,10 +287,10 @@ class Budgets:
 
 @dataclass(frozen=True)
 class Project:
-    """A whole project, valid in itself.
+    """A valid project.
 
     Attributes:
-        dashboard: the layout of the dashboard as the file has it, ``None`` if it has none.
+        dashboard: the layout of the dashboard in the file, ``None`` if it has none.
     """
 
     name: str
@@ -331,7 +331,7 @@ def bytes_of(text: str) -> int:
 
 
 def resources_of(keys: Mapping[str, Any]) -> Resources:
-    """The limits that valid keys of a node set."""
+    """The limits in valid keys of a node."""
     given = keys.get("resources", {})
     memory, cpus, pids = (given.get(key) for key in ("memory", "cpus", "pids"))
     return Resources(
@@ -342,7 +342,7 @@ def resources_of(keys: Mapping[str, Any]) -> Resources:
 
 
 def access_of(keys: Mapping[str, Any]) -> Access:
-    """What valid keys of a node open to it."""
+    """The access in valid keys of a node."""
     gpus = keys.get("gpus", ())
     return Access(
         devices=tuple(keys.get("devices", ())),
@@ -352,7 +352,7 @@ def access_of(keys: Mapping[str, Any]) -> Access:
 
 
 def keys_of(resources: Resources, access: Access) -> dict[str, Any]:
-    """The keys of a node that say this; the inverse of the two above."""
+    """The keys of a node: the inverse of :func:`resources_of` and :func:`access_of`."""
     memory = None if resources.mem_bytes is None else memory_text(resources.mem_bytes)
     limits = {"memory": memory, "cpus": resources.cpus, "pids": resources.pids}
     keys = {
@@ -365,9 +365,9 @@ def keys_of(resources: Resources, access: Access) -> dict[str, Any]:
 
 
 def parameters_of(written: Mapping[str, Any]) -> dict[str, Value]:
-    """Values by full name (``gain.p``), from valid ones that may lie in each other.
+    """Values by full name (``gain.p``), from valid values, which may be nested.
 
-    Numbers of one list are of one kind: with a float among them, all are.
+    A list with a float becomes a list of floats.
     """
     found: dict[str, Value] = {}
     for name, value in written.items():
@@ -383,7 +383,7 @@ def parameters_of(written: Mapping[str, Any]) -> dict[str, Value]:
 
 
 def parameters_to_json(parameters: Mapping[str, Value]) -> dict[str, Any]:
-    """As a project file has them."""
+    """Parameters as JSON."""
     return {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in parameters.items()

@@ -12,18 +12,18 @@ from dataclasses import dataclass
 from typing import Any
 
 MOST_CHARACTERS = 247
-"""Of a topic's full name: DDS has 255, and ROS puts up to 8 in front (``rmw/validate_full...``)."""
+"""Of a topic's full name: DDS allows 255, and ROS adds up to 8 (``rmw/validate_full...``)."""
 
 INTERNAL = "/neuros/"
-"""Where, within the namespace, the topics of connections are."""
+"""The prefix of the topics of connections, within the namespace."""
 
 SESSION = "/neuros/session/"
-"""The external topics of inputs that a session feeds; nothing of them is on the ROS graph."""
+"""The prefix of external topics that a session feeds; the ROS graph does not show them."""
 
 
 @dataclass(frozen=True)
 class Names:
-    """What a project is called on the ROS graph.
+    """The names of a project on the ROS graph.
 
     Attributes:
         namespace: empty, or as in ``/left`` or ``/lab/left``.
@@ -34,7 +34,7 @@ class Names:
     remap: tuple[tuple[str, str], ...] = ()
 
     def full(self, name: str, node: str) -> str:
-        """The full name behind ``name`` on a node, before rules."""
+        """The full name of ``name`` on a node, before rules."""
         if name.startswith("/"):
             return name
         if name.startswith("~/"):
@@ -42,7 +42,7 @@ class Names:
         return f"{self.namespace}/{name}"
 
     def resolve(self, name: str, node: str) -> str:
-        """The full name that ``name`` has in the end."""
+        """The full name of ``name`` on a node, after rules."""
         full = self.full(name, node)
         for rule, new in self.remap:
             only, _, old = rule.rpartition(":")
@@ -52,7 +52,7 @@ class Names:
 
     @property
     def ros_arguments(self) -> list[str]:
-        """The rules as ROS's own command line has them."""
+        """The rules as arguments of ROS's command line."""
         rules = [part for old, new in self.remap for part in ("-r", f"{old}:={new}")]
         return ["--ros-args", *rules] if rules else []
 
@@ -69,6 +69,6 @@ def names_from(namespace: str, remap: Mapping[str, str]) -> Names:
 
 
 def names_to_json(names: Names) -> dict[str, Any]:
-    """As a project file has them; only what there is."""
+    """Names as JSON, without empty ones."""
     content: dict[str, Any] = {"namespace": names.namespace, "remap": dict(names.remap)}
     return {key: value for key, value in content.items() if value}

@@ -6,8 +6,8 @@
     connections.SRC.OUT.DST.IN.KEY=VALUE
     budgets.KEY=VALUE                     budgets.lost_packets.SRC.OUT -> DST.IN=VALUE
 
-``VALUE`` is JSON if it parses and a text otherwise; in ``environment`` it is always a text. Without
-a value the key is removed. Inside of ``inputs`` and ``outputs`` a step is the name of a port, in
+``VALUE`` is JSON if it parses, and a text otherwise; in ``environment`` it is always a text. An
+empty value removes the key. Inside of ``inputs`` and ``outputs`` a step is the name of a port, in
 other lists an index.
 """
 
@@ -59,10 +59,9 @@ class ParsedProject:
     Attributes:
         root: the document of the project file.
         nodes: the objects that describe nodes, in order.
-        entries: for each of them, the entry of the project file that it comes from.
-        is_complete: whether every entry of ``nodes`` could be read; if not, the missing nodes
-            are unknown.
-        problems: what was wrong while reading.
+        entries: for each node, the entry of the project file that leads to it.
+        is_complete: whether every entry of ``nodes`` could be read.
+        problems: of reading.
     """
 
     root: Element
@@ -79,7 +78,10 @@ class ParsedProject:
 
 
 def parse_project(file: Path, roots: Roots) -> ParsedProject:
-    """Read a project file and its node files. Raises :class:`SourceError` for the first only."""
+    """Read a project file and its node files.
+
+    Raises :class:`SourceError` if the project file cannot be read, or has too many nodes.
+    """
     root, duplicates = read_file(file)
     nodes = root.member("nodes")
     is_list = nodes is not None and isinstance(nodes.value, list)
@@ -89,7 +91,7 @@ def parse_project(file: Path, roots: Roots) -> ParsedProject:
     for entry in root.items("nodes"):
         waiting: list[tuple[Element, _Chain]] = [(entry, (file,))]
         while waiting:
-            # Files may import each other so often that nobody could count to the end.
+            # A few files that import each other many times make billions of nodes.
             if (seen := seen + 1) > _MOST_NODES:
                 text = f"the project has more than {_MOST_NODES} nodes and node files"
                 raise SourceError(entry.problem(text, "do files import each other many times?"))
@@ -105,7 +107,7 @@ _Read: TypeAlias = "Callable[[Path], tuple[Element, list[Problem]]]"
 def _expand(
     parsed: ParsedProject, entry: Element, chain: _Chain, read: _Read
 ) -> list[tuple[Element, _Chain]]:
-    """Add the node of an entry, or return what else it holds; ``chain``: files that lead to it."""
+    """Add the node of an entry, or return its further entries; ``chain``: files that lead to it."""
     if isinstance(entry.value, dict):
         parsed.nodes.append(entry)
     elif isinstance(entry.value, list) and len(chain) > 1:
@@ -147,13 +149,13 @@ def _import(
 
 
 def names_of(parsed: ParsedProject) -> Names:
-    """The namespace and rules of a project; what has the wrong form is passed over."""
+    """The namespace and rules of a project; those of the wrong form are left out."""
     namespace = parsed.root.string("namespace") or ""
     return names_from(namespace, rules_of(parsed))
 
 
 def rules_of(parsed: ParsedProject) -> dict[str, str]:
-    """The rules of a project's ``"remap"`` that have the right form."""
+    """The rules of a project's ``"remap"``; those of the wrong form are left out."""
     rules = parsed.root.members("remap").items()
     return {old: new.value for old, new in rules if isinstance(new.value, str)}
 
@@ -162,7 +164,7 @@ def rules_of(parsed: ParsedProject) -> dict[str, str]:
 
 
 def apply_override(parsed: ParsedProject, text: str) -> list[Problem]:
-    """Apply one ``--set`` to a parsed project; what is wrong with the text itself is returned."""
+    """Apply one ``--set`` to a parsed project; returns problems of the text itself."""
     source = Source(f"--set {text}", parsed.roots.project, text)
     target, equals, value = text.partition("=")
     kind, *steps = target.split(".")
@@ -199,7 +201,7 @@ def apply_override(parsed: ParsedProject, text: str) -> list[Problem]:
 def _set(
     parent: Element, keys: list[str], source: Source, start: int, *, removes: bool
 ) -> list[Problem]:
-    """Set or remove the value at the end of ``keys``; ``start`` is its place in the source."""
+    """Set or remove the value at the end of ``keys``; ``start``: its position in the source."""
     end, is_text = len(source.text), keys[0] == "environment" and len(keys) > 1
     for step in keys[:-1]:
         key = _key(parent, step, source)
@@ -242,14 +244,14 @@ def _key(parent: Element, step: str, source: Source) -> str | int:
 
 
 def apply_namespace(parsed: ParsedProject, text: str) -> None:
-    """Apply ``--namespace`` to a parsed project, in the place of the project's own."""
+    """Replace the namespace of a parsed project by that of ``--namespace``."""
     if isinstance(parsed.root.value, dict):
         source = Source(f"--namespace {text}", parsed.roots.project, text)
         parsed.root.value["namespace"] = Element(text, source, 0, len(text), "/namespace")
 
 
 def apply_remaps(parsed: ParsedProject, texts: Sequence[str]) -> list[Problem]:
-    """Apply each ``--remap`` to a parsed project; they go before the rules of the project."""
+    """Put the rules of ``--remap`` before those of a parsed project."""
     problems: list[Problem] = []
     rules: dict[str, Element] = {}
     for text in texts:

@@ -26,7 +26,7 @@ from neuros.project.suggest import did_you_mean
 _INSTALLED = re.compile(r"@/*install/(?P<package>\w+)/*(?P<path>.*)", re.DOTALL)
 
 NOT_COPIED = shutil.ignore_patterns("__pycache__", ".*", "runs")
-"""What of a folder goes into no image, for ``shutil.copytree``."""
+"""The files that go into no image; an ``ignore`` of ``shutil.copytree``."""
 _OF_ENVIRONMENTS = "pyvenv.cfg"  # PEP 405
 _MOST_LINKED = 100_000
 _INSTEAD = "put a copy in place of the link, or remove it"
@@ -44,11 +44,10 @@ class PathError(Exception):
 class Roots:
     """The folders that paths of a project may point into, all resolved.
 
-    A path is looked up from the folder of the file that names it, then from the project's folder;
-    ``@path`` from the project's own workspace, then from that of NeuROS. ``@install/PACKAGE/path``
-    is in what was built of a message package, or will be. A leading
-    ``#`` is allowed everywhere and says the usual. Slashes behind ``#`` and ``@`` have no meaning,
-    as in ``#/model.xml``.
+    ``path`` and ``#path`` are relative to the folder of the file that names them, or else to the
+    project's folder; ``@path`` to the project's own workspace, or else to NeuROS's.
+    ``@install/PACKAGE/path`` is in the folder of a built message package. Slashes behind ``#`` and
+    ``@`` are ignored.
     """
 
     project: Path
@@ -83,10 +82,16 @@ class Roots:
                 "paths may point into the folder of the project file, and with '@' into the "
                 "workspace",
             )
-        raise PathError(f"there is no file '{text}'", self._similar(text, here))
+        hints = (
+            did_you_mean(candidate.name, os.listdir(folder))
+            for candidate in self._candidates(text, here)
+            if (folder := _resolved(candidate.parent)) and folder.is_dir()
+            if self.is_inside(folder)
+        )
+        raise PathError(f"there is no file '{text}'", next(filter(None, hints), ""))
 
     def finds(self, value: object, here: Path) -> bool:
-        """Whether a value of an environment variable is no path, or one that leads somewhere."""
+        """Whether the value of an environment variable is no path, or the path exists."""
         if not isinstance(value, str) or value[:1] not in ("#", "@") or value[:2] in ("##", "@@"):
             return True
         try:
@@ -96,7 +101,7 @@ class Roots:
         return True
 
     def _built(self, text: str) -> Path | None:
-        """A path in the folder of a built package; whether it exists is known when it is built."""
+        """A path in the folder of a message package, which need not be built yet."""
         match = _INSTALLED.fullmatch(text)
         folder = self.packages.installed(match["package"]) if match else None
         if match is None or folder is None:
@@ -120,22 +125,13 @@ class Roots:
             return [here / rest, self.project / rest, *absolute]
         return [here / text, self.project / text]
 
-    def _similar(self, text: str, here: Path) -> str:
-        for candidate in self._candidates(text, here):
-            folder = _resolved(candidate.parent)
-            if folder is not None and folder.is_dir() and self.is_inside(folder):
-                hint = did_you_mean(candidate.name, os.listdir(folder))
-                if hint:
-                    return hint
-        return ""
-
 
 def _resolved(path: Path) -> Path | None:
     """The path without symbolic links, ``None`` if it does not exist."""
     try:
         return path.resolve(strict=True)
     except (OSError, RuntimeError, ValueError):
-        # RuntimeError: a loop of links, up to Python 3.12. ValueError: no text for a path.
+        # RuntimeError: a loop of links, up to Python 3.12. ValueError: a NUL in the path.
         return None
 
 
@@ -144,21 +140,18 @@ _FILES = (".py", ".pyc", ".so")
 
 
 def is_module_name(text: str) -> bool:
-    """Whether a plugin is named as Python imports it, and not by the path of its file."""
+    """Whether the name of a plugin is that of a module, in place of a path."""
     return bool(_NAME.fullmatch(text)) and not text.endswith(_FILES)
 
 
 def find_module(name: str) -> Path | None:
-    """The file of a module that this Python has; nothing is imported.
-
-    ``None`` if it has none of that name, or one without a file.
-    """
+    """The file of an installed module, which is not imported; ``None`` if there is none."""
     spec = _specs(name)[-1]
     return Path(spec.origin) if spec and spec.has_location and spec.origin else None
 
 
 def why_no_module(name: str) -> tuple[str, str]:
-    """Why there is no such module, and a hint."""
+    """Why a module is not installed, and a hint."""
     *packages, _ = _specs(name)
     there = [spec for spec in packages if spec]
     if not there:
@@ -173,9 +166,9 @@ def why_no_module(name: str) -> tuple[str, str]:
 
 
 def is_missing(name: str, folders: Sequence[str]) -> bool:
-    """Whether there is no module of that name, neither here nor in these folders.
+    """Whether a module is neither installed nor in these folders. Nothing is imported.
 
-    Nothing is imported. Where a package may make its modules when it is imported, all are there.
+    A package that may define modules when it is imported has every module.
     """
     top = name.partition(".")[0]
     if top in sys.stdlib_module_names or name in sys.modules:
@@ -186,26 +179,26 @@ def is_missing(name: str, folders: Sequence[str]) -> bool:
         found.append(None if path is None else PathFinder.find_spec(each, path))
     found = found if found[0] else _specs(name)
     there = [spec for spec in found if spec]
-    return len(there) < len(found) and not any(map(_makes_modules, there))
+    return len(there) < len(found) and not any(map(_may_define_modules, there))
 
 
 def modules_here() -> list[str]:
-    """The names of all modules that this Python can import, but for those within packages."""
+    """The names of all modules and packages that this Python can import."""
     return [each.name for each in pkgutil.iter_modules()]
 
 
-def _makes_modules(spec: ModuleSpec) -> bool:
-    """Whether importing it may bring modules that no file has the name of."""
+def _may_define_modules(spec: ModuleSpec) -> bool:
+    """Whether the import of a module may define further modules, without files."""
     if not spec.origin or not spec.origin.endswith(".py"):
-        return spec.origin is not None  # it is compiled
+        return spec.origin is not None  # compiled code may do so
     text = Path(spec.origin).read_text("utf-8", "replace")
     return "sys.modules" in text or "__path__" in text
 
 
 def _specs(name: str) -> list[ModuleSpec | None]:
-    """Of each package that the name goes through, and of the module itself, as far as it leads.
+    """The specs of the packages of a dotted name and of the module itself; ``None`` if missing.
 
-    Finders are asked as ``import`` does, which would run the packages to get at what is in them.
+    ``importlib.util.find_spec`` would import the packages.
     """
     found: list[ModuleSpec | None] = []
     for each in accumulate(name.split("."), "{}.{}".format):
@@ -220,17 +213,16 @@ def _specs(name: str) -> list[ModuleSpec | None]:
 
 
 def files_to_copy(project: Path, output: Path) -> tuple[set[Path], list[Problem]]:
-    """The files and folders of a project that go into its images, by paths that may have links.
+    """The files and folders of a project that go into its images, and what cannot go there.
 
-    ``output``, the folder to be written, is none of them; neither is a virtual environment, or a
-    link to nothing. Problems are every link out of the project or into a circle, and whatever is
-    neither a file nor a folder.
+    Paths may go through links. The folder ``output``, virtual environments and links to nothing
+    are left out. Problems are links out of the project or into a circle, and devices and the like.
     """
     root, own = project.resolve(), output.resolve()
     found: set[Path] = set()
-    wrong: dict[Path, tuple[Path, str]] = {}  # by where it lies, to which several paths may lead
+    wrong: dict[Path, tuple[Path, str]] = {}  # by real place: several paths may lead there
     linked = 0
-    # With the folders on the way to it, and whether that goes through a link.
+    # Each with the real folders on its way, and whether the way goes through a link.
     folders: list[tuple[Path, tuple[Path, ...], bool]] = [(project, (root,), False)]
     while folders:
         folder, around, is_linked = folders.pop()

@@ -20,8 +20,9 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from neuros import hooks
+from neuros.errors import Problem
 from neuros.hooks import InputSpec, input_of, output_of, period_of
-from neuros.project.scanner import read_bytes
+from neuros.project.scanner import display_name, read_bytes
 from neuros.project.suggest import did_you_mean
 
 _MOST_BYTES = 4 << 20
@@ -61,6 +62,10 @@ class Remark:
     column: int
     text: str
     hint: str = ""
+
+    def in_file(self, path: Path) -> Problem:
+        """The problem that messages show."""
+        return Problem(display_name(path), self.line, self.column, "", self.text, self.hint)
 
 
 @dataclass(frozen=True)

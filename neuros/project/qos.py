@@ -10,17 +10,17 @@ from dataclasses import dataclass
 from typing import Any
 
 DEPTH = 10
-"""Depth where none is given: that of ROS's default profile."""
+"""The default depth, that of ROS's default profile."""
 
 
 @dataclass(frozen=True)
 class Qos:
-    """What an external topic offers (of an output), or asks for (of an input).
+    """The quality of service that an output offers, or an input requests, on an external topic.
 
     Attributes:
         reliability: ``reliable``, ``best_effort``, ``system_default`` or ``best_available``.
         durability: ``volatile``, ``transient_local``, ``system_default`` or ``best_available``.
-        depth: packets that are kept; 0: as many as the middleware keeps by default.
+        depth: of the queue, in packets; 0: the default of the middleware.
     """
 
     reliability: str
@@ -29,7 +29,7 @@ class Qos:
 
     @property
     def is_latched(self) -> bool:
-        """Whether the last packets also reach who comes later."""
+        """Whether the last packets also reach later subscribers."""
         return self.durability == "transient_local"
 
 
@@ -46,16 +46,17 @@ PRESETS: Mapping[str, Qos] = {
 """As in ``rclpy.qos.QoSPresetProfiles``."""
 
 OFFERED = Qos("reliable")
-"""What an output offers by default: what ROS's default profile does."""
+"""The default of an output: that of ROS."""
 
 ASKED = Qos("best_effort")
-"""What an input asks for by default: it matches reliable and best-effort publishers."""
+"""The default of an input: it matches reliable and best-effort publishers."""
 
 
 def qos_of(written: Any, *, is_input: bool) -> Qos:
     """The quality of service that a valid ``"qos"`` describes.
 
-    What it leaves out is as without it, but that only a reliable input gets what was sent before.
+    Missing keys have their defaults. A latched input is reliable by default: a best-effort one
+    would not get earlier packets.
     """
     if isinstance(written, str):
         return PRESETS[written]
@@ -70,7 +71,7 @@ def qos_of(written: Any, *, is_input: bool) -> Qos:
 
 
 def qos_to_json(qos: Qos) -> Any:
-    """As a project file has it: a preset by its name, where it is one."""
+    """Quality of service as JSON: a preset by its name."""
     for name, preset in PRESETS.items():
         if preset == qos:
             return name

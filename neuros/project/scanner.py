@@ -1,9 +1,9 @@
 """JSON values with their positions in the file.
 
-Python's ``json`` keeps neither the positions of keys and values nor duplicate keys (the last one
-wins silently), and both are needed to tell a user what is wrong where. So the brackets are read
-here, and Python's ``json`` reads the scalars. PyYAML, which keeps positions, refuses what JSON
-allows: a key of 1025 characters, a character in two escapes, a colon in the line after its key.
+Messages to users need the positions of keys and values, and duplicate keys; Python's ``json`` keeps
+neither. So this module reads the brackets, and ``json`` the scalars. PyYAML, which keeps positions,
+refuses valid JSON: a key of 1025 characters, a character in two escapes, a colon in the line after
+its key.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class Source:
     """A text with JSON in it.
 
     Attributes:
-        name: what messages call it.
-        folder: where relative paths in it start.
-        file: the file that it was read from, if it was.
+        name: for messages.
+        folder: of relative paths in the text.
+        file: that holds the text; ``Path()`` for the value of an option.
     """
 
     name: str
@@ -63,10 +63,11 @@ class Element:
     """A JSON value and its place.
 
     Attributes:
-        value: a ``dict`` or ``list`` of elements, or what ``json.loads`` makes of a scalar.
-        start: position of the first character; ``end`` is behind the last one.
-        key_start: position of the key in front of it, ``start`` where there is none.
-        pointer: its JSON pointer in the file.
+        value: a ``dict`` or ``list`` of elements, or the Python value of a scalar.
+        start: position of the first character.
+        end: position behind the last character.
+        key_start: position of the key before the value, ``start`` if there is none.
+        pointer: JSON pointer in the file.
     """
 
     value: Any
@@ -95,7 +96,7 @@ class Element:
         return self.value
 
     def member(self, key: str) -> Element | None:
-        """The member of that key, ``None`` if this is no object or has none."""
+        """The member of that key, ``None`` if it is missing, or this is no object."""
         return self.value.get(key) if isinstance(self.value, dict) else None
 
     def string(self, key: str) -> str | None:
@@ -152,11 +153,11 @@ def display_name(path: Path) -> str:
 
 
 def read_bytes(path: Path, most_bytes: int | None = None) -> bytes:
-    """The content of a file that somebody else has written, and who may not make us wait.
+    """The content of a file of the user.
 
     Raises:
-        OSError: if it cannot be read, has more than ``most_bytes``, or is a pipe or device, which
-            may have no end.
+        OSError: if the file cannot be read, has more than ``most_bytes``, or is a pipe or device,
+            which may have no end.
     """
     with open_ordinary(path) as file:
         if most_bytes is not None and os.fstat(file.fileno()).st_size > most_bytes:
@@ -165,7 +166,7 @@ def read_bytes(path: Path, most_bytes: int | None = None) -> bytes:
 
 
 def half_character(text: str) -> str:
-    r"""What is wrong with a text that cannot be written as UTF-8 for a lone ``'\ud800'``, or ""."""
+    r"""The problem of a text with a lone ``'\ud800'``, which UTF-8 cannot encode; else empty."""
     found = _HALF_CHARACTER.search(text)
     return f"found half of a character, \\u{ord(found[0]):04x}" if found else ""
 
@@ -207,7 +208,7 @@ class _Scanner:
         self.token, self.duplicates = next(tokens), list[Problem]()
 
     def value(self, pointer: str, depth: int = 1) -> Element:
-        """The value that begins with the current token, which is the one behind it afterwards."""
+        """Read the value that begins with the current token, up to the token behind it."""
         start, opening = self.token.start(), self.token[0]
         if opening not in ("{", "["):
             value, end = self._scalar(pointer)
@@ -288,7 +289,7 @@ class _Scanner:
 
 
 def place_of(file: Path, pointer: str) -> tuple[int, int]:
-    """Line and column of a pointer in a file; (1, 1) where there is none any more."""
+    """Line and column of a pointer in a file; (1, 1) if the file has changed since."""
     try:
         root, _ = read_file(file)
         parts = (part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:])
@@ -299,7 +300,7 @@ def place_of(file: Path, pointer: str) -> tuple[int, int]:
 
 
 def problem_in(file: Path, pointer: str, text: str, hint: str = "") -> Problem:
-    """A problem at a pointer in a file that has been read before."""
+    """A problem at a pointer in a file."""
     return Problem(display_name(file), *place_of(file, pointer), pointer, text, hint)
 
 

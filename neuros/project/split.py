@@ -29,10 +29,7 @@ from neuros.project.qos import qos_of, qos_to_json
 
 
 def split(project: Project, folders_for: Callable[[Node], Folders]) -> tuple[NodeFile, ...]:
-    """Cut a project into one part per node, in the order of the nodes.
-
-    ``folders_for`` gives the folders of a node, as that node sees them.
-    """
+    """Cut a project into one part per node, in the order of the nodes."""
     return tuple(
         NodeFile(
             node=node,
@@ -69,7 +66,7 @@ def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
 
 
 def node_file_text(node_file: NodeFile) -> str:
-    """``node.json`` as it is written."""
+    """The text of ``node.json``."""
     return json.dumps(node_file_to_json(node_file), indent=2) + "\n"
 
 
@@ -110,10 +107,10 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
 
 
 def node_files_from_json(contents: Iterable[Mapping[str, Any]]) -> list[NodeFile]:
-    """Those of nodes that share a process.
+    """The node files of a process.
 
-    A connection between two of them is one object for both, so that a look-up finds it
-    without a comparison of all its fields.
+    A connection between two of the nodes is one object, so that a look-up finds it without a
+    comparison of all fields.
     """
     files = [node_file_from_json(content) for content in contents]
     known: dict[Connection, Connection] = {}
@@ -126,7 +123,7 @@ def node_files_from_json(contents: Iterable[Mapping[str, Any]]) -> list[NodeFile
 def project_to_json(project: Project) -> dict[str, Any]:
     """The expanded project: every node in place, every path absolute, every value a text.
 
-    It is a valid project file, to be loaded with the folder of the original project.
+    The result is a valid project file for the folder of the original project.
     """
     content: dict[str, Any] = {"description": project.description} if project.description else {}
     content["nodes"] = [
@@ -146,7 +143,7 @@ def project_to_json(project: Project) -> dict[str, Any]:
 
 
 def budgets_to_json(budgets: Budgets) -> dict[str, Any]:
-    """The budgets as a project file has them."""
+    """Budgets as JSON."""
     values = {**vars(budgets), "lost_packets": dict(budgets.lost_packets)}
     return {key: value for key, value in values.items() if value not in (None, {})}
 
@@ -154,7 +151,7 @@ def budgets_to_json(budgets: Budgets) -> dict[str, Any]:
 def translated(node: Node, translate: Callable[[Path], Path]) -> Node:
     """The node with the paths of its plugin, script and environment translated.
 
-    The file that describes the node is not translated: it is for messages to the user.
+    The path of the file that describes the node stays: it is for messages to the user.
     """
     return replace(
         node,
@@ -197,7 +194,7 @@ def _port_keys(port: Port) -> dict[str, Any]:
 
 
 def _written(node: Node, key: str, value: str) -> str:
-    """A variable of the environment as a project file writes it."""
+    """The value of an environment variable in a project file."""
     if key in node.environment_paths:
         return f"#{value}"
     return value[0] + value if value[:1] in ("#", "@") else value

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-_MOST_WORDS = 1000  # to compare with more takes seconds
+_MOST_WORDS = 1000  # a comparison with more takes seconds
 
 
 def did_you_mean(found: str, allowed: Iterable[str]) -> str:

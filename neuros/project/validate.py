@@ -1,7 +1,7 @@
 """Schema violations of a project, in sentences; and NEST nodes that cannot share a process.
 
-The schema is the only grammar of the configuration. What it cannot express (names that occur
-twice, connections that end nowhere) is in :mod:`neuros.project.checks`.
+The schema is the only grammar of the configuration. Rules that it cannot express (names that occur
+twice, connections that end nowhere) are in :mod:`neuros.project.checks`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from neuros.project.scanner import Element, problem_in
 from neuros.project.suggest import did_you_mean, listed
 
 MOST_PROBLEMS = 200
-"""Of one kind that are looked for: nobody reads more, and to find all takes minutes."""
+"""Of one check: nobody reads more, and a search for all can take minutes."""
 SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "schema"
 
 _KINDS = {
@@ -37,7 +37,7 @@ _KINDS = {
 
 
 def violations(parsed: ParsedProject) -> list[Problem]:
-    """Everything in the files of a project that violates the schema."""
+    """The violations of the schema in the files of a project."""
     found = violations_in(parsed.root, "project")
     for node in parsed.nodes:
         if node.source is not parsed.root.source:
@@ -54,19 +54,19 @@ def schema(name: str) -> dict[str, Any]:
 
 
 def mistake(content: Any, name: str, part: str = "") -> str:
-    """What is wrong with the content of a file that NeuROS has written, empty if nothing is.
+    """The first violation in the content of a file that NeuROS has written, empty if none.
 
-    ``part`` of the schema of that name is its form, as ``"#/$defs/node_file"``.
+    ``part``: the definition in the schema of that name, as ``"#/$defs/node_file"``.
     """
     error = next(_validator(name, part).iter_errors(content), None)
     return "" if error is None else f"{error.json_path}: {_sentence(error)[0]}"
 
 
 def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tuple[Problem, ...]:
-    """The NEST nodes, among those of ``names`` (``None``: all), that would have to share a process.
+    """A problem for each NEST node but the first, among ``names`` (``None``: all nodes).
 
-    NEST has one kernel per process, so that this matters to back ends that put all nodes into
-    one. Nodes that use NEST are known by their container here.
+    NEST has one kernel per process, so a back end with one process cannot run several. A node uses
+    NEST if its container does.
     """
     chosen = [node for node in project.nodes if names is None or node.name in names]
     nest = [node for node in chosen if node.container.partition(":")[0] == "neuros_nest"]
@@ -83,7 +83,7 @@ def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tu
 
 
 def violations_in(element: Element, name: str) -> list[Problem]:
-    """Everything in a document that violates the schema of that name."""
+    """The violations of the schema of that name in a document."""
     errors = _validator(name).iter_errors(element.plain)
     found = (problem for error in errors for problem in _sentences(error, element))
     return [*islice(found, MOST_PROBLEMS)]
@@ -104,20 +104,20 @@ def _validator(name: str, part: str = "") -> Any:
             yield ValidationError(f"does not match {expected}")
 
     def unique(validator: Any, wanted: bool, instance: Any, of: Any) -> Iterator[ValidationError]:
-        # It takes the square of their number, and there may be millions.
+        # The check takes the square of the number of items, and there may be millions.
         if not isinstance(instance, list) or len(instance) <= of["maxItems"]:
             yield from Draft202012Validator.VALIDATORS["uniqueItems"](
                 validator, wanted, instance, of
             )
 
     def finite(_: Any, instance: Any) -> bool:
-        # JSON has no other numbers, but Python's reader takes NaN, with which nothing compares.
+        # Python's reader accepts NaN, for which every comparison is false.
         is_number = isinstance(instance, (int, float)) and not isinstance(instance, bool)
         return is_number and (isinstance(instance, int) or math.isfinite(instance))
 
     schemas = {key: schema(key) for key in ("project", "node", "run", "deployment")}
     for content in schemas.values():
-        del content["$schema"]  # where a reference leads to one, it would undo what is extended
+        del content["$schema"]  # in a referenced schema it would select the stock validator
     registry = Registry().with_resources(
         (content["$id"], DRAFT202012.create_resource(content)) for content in schemas.values()
     )
@@ -128,7 +128,7 @@ def _validator(name: str, part: str = "") -> Any:
         return type(instance) is int
 
     types = Draft202012Validator.TYPE_CHECKER.redefine("number", finite)
-    if name == "run":  # others are converted: in a project, 2.0 is a whole number
+    if name == "run":  # in a project, 2.0 is a whole number, too
         types = types.redefine("integer", whole)
     return extend(Draft202012Validator, own, type_checker=types)(form, registry=registry)
 
