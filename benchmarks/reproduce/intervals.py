@@ -23,7 +23,7 @@ def intervals_of(moments_ns: Sequence[int], period_s: float) -> dict[str, Any] |
     """What ``run.json`` says of a timed hook, of any moments; ``None`` of fewer than two."""
     book = TickIntervals(round(period_s * 1e9))
     for moment_ns in moments_ns:
-        book.note(moment_ns)
+        book.record(moment_ns)
     return book.figures()
 
 

@@ -62,8 +62,8 @@ def without_ledger() -> dict[Place, Any]:
         (Engine, "_run"): rewritten(
             Engine._run, {**no_clock, "self.spent_ns[": "", "hook.busy_ns +=": ""}
         ),
-        (Subscription, "take"): rewritten(
-            Subscription.take, {"self.taken.append": "", "self.taken_ns.append": ""}
+        (Subscription, "consume"): rewritten(
+            Subscription.consume, {"self.taken.append": "", "self.taken_ns.append": ""}
         ),
         (SendWindow, "spend"): rewritten(SendWindow.spend, {"self.sent_ns.append": ""}),
         (SimulatedTime, "look"): rewritten(SimulatedTime.look, {"self._timeline.note": ""}),

@@ -1,18 +1,19 @@
 """The engine: one node's hooks, run by events.
 
-Every event (a packet, an acknowledgement, a registration, a due timer, the loop-back) is one call
-of a method here. It changes some counters and is followed by one *pass*: each hook is looked at
-once, least recently executed first, and runs if it is ready at its turn. If one is still ready
-afterwards, the engine asks for a loop-back, an event that is handled after all that already wait.
-Arrivals come first: where something may have reached the node while a hook ran, the pass ends, and
-the loop-back goes on when that has been taken in. So no hook starts on a backlog.
-All that leaves the engine goes through :class:`Effects`.
+Each event (a packet, an acknowledgement, a registration, a due timer, the loop-back) is a call of a
+method of :class:`Engine`. It changes some counters and is followed by one *pass*: the engine checks
+each hook once, least recently executed first, and runs it if it is ready at its turn. If a hook is
+still ready afterwards, the engine posts a loop-back, an event that comes after all waiting events.
+Arrivals come before hooks: if something may have reached the node while a hook ran, the pass ends,
+and the loop-back continues it after the arrivals. So no hook starts on a backlog.
+The engine acts on the world through :class:`Effects` only.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Protocol
 
 from neuros.engine.hook import Hook, Source
@@ -26,35 +27,35 @@ from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec
 from neuros.project.model import Connection, Node
 
-_LONG_NS = 1_000_000  # as long as a turn of events: see neuros.transport.ros_loop
+_LONG_NS = 1_000_000  # the length of a turn of events in neuros.transport.ros_loop
 
 
 class Effects(Links, Protocol):
     """The only way out of an engine: its calls are all that the engine does to the world."""
 
     def has_taken_in(self) -> bool:
-        """Whether all that had reached the node has become an event, so that a hook may start.
+        """Whether every arrival has become an event, so that a hook may start.
 
-        After a False, a loop-back comes.
+        After False, a loop-back follows.
         """
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         """Run a hook of the plugin; raises ``HookError``."""
 
     def give_way(self) -> None:
-        """A hook has taken long: let the other nodes of the process go on before the next one."""
+        """Let the other nodes of the process run before the next hook: this one ran long."""
 
     def post(self, event: Callable[[], None]) -> None:
-        """Have a delivery to the node itself handled after all events that already wait."""
+        """Handle a delivery to the node itself after all waiting events."""
 
     def post_loop_back(self, event: Callable[[], None]) -> None:
-        """Have the loop-back handled after all events that already wait, outside ones too."""
+        """Handle the loop-back after all waiting events, also those outside of the process."""
 
     def note_ready(self) -> None:
-        """The node has initialised as far as it can alone, and awaits :meth:`Engine.activate`."""
+        """Report that the node has initialised, and waits for :meth:`Engine.activate`."""
 
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
-        """A copy for a connection of the node to itself; it shares nothing with this packet."""
+        """A copy of a packet for a connection of the node to itself; nothing is shared."""
 
 
 class Engine:
@@ -62,21 +63,21 @@ class Engine:
 
     Args:
         node: the node, with its ports.
-        connections: all connections that begin or end at it, in the project's order.
+        connections: all connections that begin or end at the node, in the project's order.
         specs: its hooks, in the order of declaration.
-        packet_types: per output name, what hooks must return; any value will do for others.
+        packet_types: by output name, what hooks must return; other outputs allow any value.
         clock: monotonic wall clock in nanoseconds.
 
     Attributes:
-        all_hooks: in the order of declaration, those that will not run again, too.
+        all_hooks: in the order of declaration, also those that will not run again.
         executing: the hook that runs now.
-        since_ns: when that started, or else up to when the time is counted.
-        spent_ns: wall time by cause; that of executions is counted by each hook.
+        since_ns: start of the running hook, or else the time up to which ``spent_ns`` counts.
+        spent_ns: wall time by cause; each hook counts its own executions.
         execution_log: the first executions.
         sim_clock: simulated time, as far as the node knows it.
 
     Raises:
-        HookError: if a hook names a port that the node has not, or needs an input without source.
+        HookError: if a hook names an unknown port, or requires an input that nothing feeds.
     """
 
     def __init__(
@@ -97,10 +98,10 @@ class Engine:
         self.subscriptions, self.send_windows = ports.subscriptions, ports.send_windows
         self.outputs = ports.outputs
         for connection, window in self.send_windows.items():
-            if connection in self.subscriptions:  # the node's to itself
+            if connection in self.subscriptions:  # of the node to itself
                 self.subscriptions[connection].acknowledge = self._crediting(window)
         self._arrivals = 0
-        self._to_itself = 0  # packets of the node for itself that are on their way
+        self._to_itself = 0  # packets of the node to itself that have not arrived
         self._schedule = Schedule()
         self.all_hooks = [
             Hook(spec, ports.inputs_of(spec), self.outputs) for spec in specs if spec.is_scheduled
@@ -122,10 +123,10 @@ class Engine:
     # ------------------------------------------------------------------ events
 
     def start(self, *, awaits_others: bool = False) -> None:
-        """Begin: initialise as soon as every receiver is there, then run the other hooks.
+        """Initialise as soon as every receiver is there, then run the other hooks.
 
         Args:
-            awaits_others: whether the other hooks wait for :meth:`activate` besides.
+            awaits_others: whether the other hooks also wait for :meth:`activate`.
         """
         self._wake()
         self._lifecycle.start(awaits_others=awaits_others)
@@ -134,8 +135,8 @@ class Engine:
     def activate(self) -> None:
         """Every node of the project is ready: tick and function hooks may start.
 
-        None starts before the next event. A hook of one node would delay time 0, from which ticks
-        count, for the nodes that share its thread.
+        They start with the next event. A hook that started now would delay time 0, from which ticks
+        count, of the other nodes in the thread.
         """
         self._wake()
         self._lifecycle.activate()
@@ -149,11 +150,11 @@ class Engine:
         self._pass()
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
-        """All takers at the far end have started on the packets up to ``position``."""
+        """All hooks at the far end have started on the packets up to ``position``."""
         now_ns = self._wake()
         self.send_windows[connection].credit(position, now_ns)
         if not self.execution_log.is_full:
-            self.execution_log.note_credit(connection, position, now_ns)
+            self.execution_log.record_credit(connection, position, now_ns)
         self._pass()
 
     def on_registered(self, connection: Connection) -> None:
@@ -168,27 +169,31 @@ class Engine:
         self._pass()
 
     def on_loop_back(self) -> None:
-        """The event that the engine posted to itself.
-
-        All that waited then has been taken in, but a hook may have run since: it is an event like
-        any other.
-        """
+        """The event that the engine posted to itself has come."""
         self._wake()
         self._has_posted_loop_back = False
         self._pass()
 
     def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
-        """Send packets as if a hook with those outputs had returned them, once it might run.
+        """Send packets, by output, as soon as a hook that returns them could run.
 
-        ``accepted`` is called when they are sent. Returns a function that withdraws the offer; it
-        has no effect any more once that is accepted. Offers for the same outputs wait in line.
+        Offers for the same outputs are accepted in their order. ``accepted`` is called when the
+        packets are sent. Returns a function that withdraws the offer until then.
 
         Raises:
             HookError: if the node has no such output, or a packet is of another type.
         """
         self._wake()
         names = tuple(sorted(packets))
-        source = self._sources.get(names) or self._add_source(names)
+        source = self._sources.get(names)
+        if source is None:
+            for name in names:
+                if name not in self.outputs:
+                    text = undeclared("output", name, self.outputs, self.node)
+                    raise HookError(text, hook="submit", where=str(self.node.plugin))
+            source = self._sources[names] = Source(names, self.outputs, str(self.node.plugin))
+            self._lifecycle.add_source(source)
+            self.all_hooks.append(source)
         withdraw = source.offer([packets[name] for name in names], accepted)
         self._pass()
         return withdraw
@@ -197,8 +202,8 @@ class Engine:
         """Stop the hooks that send unasked; the others go on.
 
         Args:
-            last_round: places in :attr:`all_hooks` of hooks that would go on for ever (each of a
-                loop waits for the one before): they start at most once more.
+            last_round: places in :attr:`all_hooks` of the hooks of endless loops: each starts at
+                most once more.
         """
         self._wake()
         self._lifecycle.drain(self.all_hooks[place] for place in last_round)
@@ -206,10 +211,9 @@ class Engine:
         self.resume()
 
     def pause(self) -> None:
-        """Start no further hook until :meth:`resume`, but for initialise hooks and steps.
+        """Start only initialise hooks and steps until :meth:`resume`.
 
-        Where draining has begun it has no effect. A second time it takes back what is left of
-        steps.
+        A second pause revokes the steps that are left. A pause of a draining node has no effect.
         """
         now_ns = self._wake()
         if not self._lifecycle.is_draining:
@@ -217,7 +221,7 @@ class Engine:
         self._cause = self.rest()
 
     def resume(self) -> None:
-        """Go on after a pause; without one it has no effect."""
+        """Go on after a pause."""
         if self._pause.is_on:
             self._pause.end(self._wake())
             self._pass()
@@ -225,15 +229,16 @@ class Engine:
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let each hook that starts unasked do so ``count`` times more.
 
-        The others answer what they receive; where nothing drives the project (``is_driven`` is
-        false), each hook starts so many times. See :class:`~neuros.engine.schedule.Pause`.
+        The other hooks answer the packets that they receive; if no hook starts unasked in the whole
+        project (``is_driven`` is false), each hook starts ``count`` times. See
+        :class:`~neuros.engine.schedule.Pause`.
         """
         self._wake()
         self._pause.grant(count, is_driven=is_driven)
         self._pass()
 
     def stop_hooks(self) -> None:
-        """Start no further hook, ever (what the running one returns is still sent). Any thread."""
+        """Start no further hook; the packets of the running one are still sent. Any thread."""
         self._lifecycle.is_stopped = True
 
     # ------------------------------------------------------------------ questions
@@ -245,7 +250,7 @@ class Engine:
 
     @property
     def is_active(self) -> bool:
-        """Whether it has begun, and need not wait for other nodes to become ready."""
+        """Whether every receiver is there, and every node that it waits for is ready."""
         return self._lifecycle.has_begun and self._lifecycle.is_active
 
     @property
@@ -260,17 +265,17 @@ class Engine:
 
     @property
     def is_paused(self) -> bool:
-        """Whether hooks stand still, but for steps."""
+        """Whether hooks start in steps only."""
         return self._pause.is_on
 
     @property
     def pauses(self) -> Pause:
-        """Its pause, with the times in which it stood still."""
+        """The pause of the node, with its times."""
         return self._pause
 
     @property
     def is_driving(self) -> bool:
-        """Whether it has hooks that start unasked, and so keep a project going."""
+        """Whether it has hooks that start unasked, and so drive the project."""
         return any(map(drives, tuple(self.all_hooks)))
 
     @property
@@ -280,7 +285,7 @@ class Engine:
 
     @property
     def next_due_ns(self) -> int | None:
-        """When :meth:`on_timer` is wanted next, on the clock that was given; ``None``: never."""
+        """The time of the next :meth:`on_timer`, on the clock of the engine; ``None``: never."""
         if self._pause.is_on:
             return None
         return min(
@@ -300,10 +305,10 @@ class Engine:
 
     @property
     def is_wakeable(self) -> bool:
-        """Whether a hook is ready, or something other than its connections could make one so.
+        """Whether a hook is ready, or could become so without a packet on a connection.
 
-        That is a receiver or a node that has still to appear, a timer, or an external topic. A
-        thread that may offer packets is known to the runtime only.
+        A missing receiver or node, a timer, or an external topic may make it ready. Threads that
+        offer packets are left out: only the runtime knows them.
         """
         if self.is_stopped:
             return False
@@ -316,17 +321,17 @@ class Engine:
         return tuple(self._schedule.order)
 
     def free_running_hooks(self) -> Sequence[Hook]:
-        """Hooks that nothing but blocked outputs ever holds up: the node's main loops."""
+        """The node's main loops: function hooks without required inputs."""
         return self._schedule.free_running_hooks()
 
     def untaken_subscriptions(self) -> Sequence[Subscription]:
-        """Connections to inputs that no hook takes, but for the clock, which the node takes."""
+        """Connections to inputs that no hook declares, without the clock, which the node reads."""
         found = (s for s in self.subscriptions.values() if not s.queues)
         return [s for s in found if not isinstance(s, ClockSubscription)]
 
     def rest(self) -> Rest:
-        """The state of the node now, and its cause."""
-        executing = self.executing  # read once: other threads ask, too
+        """The state of the node now, and its cause. Any thread."""
+        executing = self.executing  # read once: the engine may change it meanwhile
         if executing is not None:
             return Rest(State.EXECUTING, executing.name)
         if not self._lifecycle.has_begun or self._lifecycle.awaits_others:
@@ -339,19 +344,19 @@ class Engine:
     # ------------------------------------------------------------------ inside
 
     def _wake(self) -> int:
-        """Count the time since the last event, and note the ticks due by now; returns the time."""
+        """Count the time since the last event, and mark the due ticks; returns the time."""
         now_ns = self._clock()
         if self._ticks and not self._pause.is_on:
             for hook in self._ticks:
                 if hook.is_enabled and not hook.is_due and hook.due_ns <= now_ns:
                     hook.is_due = True
-        if self.executing is None:  # else it is the hook's, and counted when that ends
+        if self.executing is None:  # else the time is the hook's, which counts it at its end
             self.spent_ns[self._cause] += now_ns - self.since_ns
             self.since_ns = now_ns
         return now_ns
 
     def _pass(self) -> None:
-        if self._is_passing:  # a hook that spins, say: hooks never nest, the loop-back sees to it
+        if self._is_passing:  # hooks never nest, even if one spins: the loop-back continues
             return
         lifecycle, pause = self._lifecycle, self._pause
         if not lifecycle.has_begun:
@@ -379,27 +384,24 @@ class Engine:
         else:
             self._cause = self._schedule.cause_of_rest()
         if not lifecycle.is_active and self._cause is not SCHEDULING and not self._to_itself:
-            self._await_others()
+            # No initialise hook could start: each has run, or needs a packet of another node.
+            if not lifecycle.is_ready:
+                lifecycle.is_ready = True
+                self._effects.note_ready()
+            if lifecycle.awaits_others:
+                self._cause = REGISTERING
         if self._cause is SCHEDULING and not (self._has_posted_loop_back or lifecycle.is_stopped):
             self._has_posted_loop_back = True
             self._effects.post_loop_back(self.on_loop_back)
 
-    def _await_others(self) -> None:
-        """No initialise hook could start: each has run, or needs something of another node."""
-        if not self._lifecycle.is_ready:
-            self._lifecycle.is_ready = True
-            self._effects.note_ready()
-        if self._lifecycle.awaits_others:
-            self._cause = REGISTERING
-
     def _run(self, hook: Hook) -> None:
-        """Start a hook: move it to the end of the order, take its packets, send what it returns."""
+        """Run a hook: move it to the end of the order, consume its inputs, send its packets."""
         self._schedule.move_to_end(hook)
         start_ns = self._clock()
         if self._pause.is_on:
-            self._pause.note_start(hook, start_ns)
+            self._pause.record_start(hook, start_ns)
         elif hook.ticks is not None:
-            hook.ticks.note(start_ns)
+            hook.ticks.record(start_ns)
             hook.set_due(self._lifecycle.tick_start_ns, start_ns)
         if self._lifecycle.last_round and hook in self._lifecycle.last_round:
             self._lifecycle.finish_round(hook)
@@ -408,11 +410,11 @@ class Engine:
         self.executing = hook
         try:
             if isinstance(hook, Source):
-                result: Any = hook.take()
+                result: Any = hook.consume()
             else:
                 arguments = []
                 for hook_input in hook.inputs:
-                    arguments.append(hook_input.take(start_ns))
+                    arguments.append(hook_input.consume(start_ns))
                 result = self._effects.call(hook, arguments)
         finally:
             self.executing = None
@@ -421,53 +423,36 @@ class Engine:
             hook.busy_ns += end_ns - start_ns
             self.since_ns = end_ns
             if not self.execution_log.is_full:
-                self.execution_log.note_execution(hook, start_ns, end_ns)
+                self.execution_log.record_execution(hook, start_ns, end_ns)
         if end_ns - start_ns > _LONG_NS:
             self._effects.give_way()
         for output, packet in hook.packets_of(result):
-            self._send(output, packet, self.since_ns)
+            self._send(output, packet)
         if isinstance(hook, Source):
             hook.accept()
         elif hook.spec.kind is HookKind.INITIALISE:
-            self._retire(hook)
+            for hook_input in hook.inputs:
+                for queue in hook_input.queues:
+                    queue.subscription.remove(queue)
             self._lifecycle.finish_initialiser(hook)
             if self._pause.is_on:
                 self._pause.wake_ticks()
 
-    def _retire(self, hook: Hook) -> None:
-        """Remove the input queues of a hook that will never run again."""
-        for hook_input in hook.inputs:
-            for queue in hook_input.queues:
-                queue.subscription.remove(queue)
-
-    def _send(self, output: Output, packet: Any, now_ns: int) -> None:
-        """Send a packet now on all connections of an output, or on its external topic."""
+    def _send(self, output: Output, packet: Any) -> None:
+        """Send a packet on all connections of an output, or on its external topic."""
         for window in output.windows:
-            window.spend(now_ns)
+            window.spend(self.since_ns)
         for connection in output.to_itself:
-            self._send_to_itself(connection, packet)
+            own = self._effects.copy_to_itself(connection, packet)
+            self._to_itself += 1
+            self._effects.post(partial(self._arrive, connection, own))
         if output.send is not None:
             output.send(packet)
 
-    def _send_to_itself(self, connection: Connection, packet: Any) -> None:
-        own = self._effects.copy_to_itself(connection, packet)
-        self._to_itself += 1
-
-        def arrive() -> None:
-            self._to_itself -= 1
-            self.on_packet(connection, own)
-
-        self._effects.post(arrive)
+    def _arrive(self, connection: Connection, packet: Any) -> None:
+        """A packet of the node to itself arrives."""
+        self._to_itself -= 1
+        self.on_packet(connection, packet)
 
     def _crediting(self, window: SendWindow) -> Callable[[int], None]:
         return lambda position: window.credit(position, self._clock())
-
-    def _add_source(self, names: tuple[str, ...]) -> Source:
-        for name in names:
-            if name not in self.outputs:
-                text = undeclared("output", name, self.outputs, self.node)
-                raise HookError(text, hook="submit", where=str(self.node.plugin))
-        source = self._sources[names] = Source(names, self.outputs, str(self.node.plugin))
-        self._lifecycle.add_source(source)
-        self.all_hooks.append(source)
-        return source

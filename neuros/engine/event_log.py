@@ -1,9 +1,9 @@
-"""The event log of an engine: a row of numbers, from which a replay makes the events again.
+"""The event log of an engine, an array of integers, and its replay.
 
-An engine decides by its events, and, where hooks have a period, by what its clock says. So both
-are noted, in their order, and each start of a hook besides, to check against. A number below zero
-is an event (its complement has the kind in 5 bits, a place in 20 and a position in 38), any other
-one a reading of the clock. An entry costs some 0.1 us.
+The decisions of an engine follow from its events and, if hooks have a period, from the readings of
+its clock. The log holds both in their order, and each start of a hook, for a check of the replay. A
+negative entry is an event: its complement holds the kind in 5 bits, a place in 20 and a position in
+38. Other entries are readings of the clock in ns. An entry costs some 0.1 us.
 """
 
 from __future__ import annotations
@@ -27,30 +27,30 @@ _POSITION_SHIFT = _KIND_BITS + _PLACE_BITS
 class EventKind(IntEnum):
     """The kinds of entries; ``place`` and ``position`` where they have one."""
 
-    BEGIN = 0  # never written: what comes before the first event
+    BEGIN = 0  # never written: holds the readings before the first event
     START = 1  # place: 1 if the node waits until all others are ready
     PACKET = 2  # place: index of the connection
-    HEARD = 3  # place: of the input, bound to an external topic, among the inputs of the node
+    EXTERNAL = 3  # a packet on an external topic; place: of the input, in the node
     ACKNOWLEDGEMENT = 4  # place: index of the connection; position
     REGISTERED = 5  # place: index of the connection
     TIMER = 6
     LOOP_BACK = 7
     OFFER = 8
     DRAIN = 9
-    STOP = 10  # no further hook starts: the log is whole
-    HOOK = 11  # place: of the hook that starts, in the order of declaration
+    STOP = 10  # no further hook starts: the last entry of a whole log
+    HOOK = 11  # place: of the starting hook, in the order of declaration
     PAUSE = 12
     RESUME = 13
-    STEP = 14  # place: 1 if some node of the project drives it; position: how many
-    DEFERRED = 15  # the pass ended, for what had arrived; position: how many hooks it had started
-    LAST_ROUND = 16  # place: of a hook that starts at most once more when the node drains: next
+    STEP = 14  # place: 1 if a node drives the project; position: count
+    DEFERRED = 15  # the pass ended before its time for arrivals; position: hooks started in it
+    LAST_ROUND = 16  # before DRAIN; place: of a hook that starts at most once more
     ACTIVATE = 17
 
 
 class Event(NamedTuple):
-    """An event, and what the clock said from then to the next one.
+    """An event, and the readings of the clock up to the next event.
 
-    ``limit``: after so many starts its pass ended, for what had arrived; ``None``: it did not.
+    ``limit``: starts of hooks after which arrivals ended the pass; ``None``: nothing ended it.
     """
 
     kind: EventKind
@@ -61,9 +61,9 @@ class Event(NamedTuple):
 
 
 class LoggedEngine(Engine):
-    """Notes its events in :attr:`event_log`, until the packet log takes the entries away.
+    """An engine that records its events in :attr:`event_log`.
 
-    Its arguments are those of :class:`Engine`.
+    The packet log empties the array from time to time. The arguments are those of :class:`Engine`.
     """
 
     def __init__(
@@ -76,77 +76,90 @@ class LoggedEngine(Engine):
         packet_types: Mapping[str, PacketType] | None = None,
     ) -> None:
         self.event_log = array("q")
-        self._note = self.event_log.append
+        self._record = self.event_log.append
+        record = self._record
+
+        def recorded_clock() -> int:
+            now_ns = clock()
+            record(now_ns)
+            return now_ns
+
+        def recorded_has_taken_in() -> bool:
+            is_in = effects.has_taken_in()
+            if not is_in:
+                record(_entry(EventKind.DEFERRED, position=self._starts))
+            return is_in
+
         has_ticks = any(spec.period_s is not None for spec in specs)
-        own_clock = self._noting(clock) if has_ticks else clock
+        own_clock = recorded_clock if has_ticks else clock
         super().__init__(node, connections, specs, effects, own_clock, packet_types)
-        self._has_taken_in = self._noting_deferral(effects.has_taken_in)
+        self._has_taken_in = recorded_has_taken_in
         self._starts = 0
         self._hook_entries = {
             hook: _entry(EventKind.HOOK, place) for place, hook in enumerate(self.all_hooks)
         }
         self._packet_entries: dict[Connection | str, int] = {
             connection: _entry(EventKind.PACKET, connection.index) for connection in connections
-        } | {port.name: _entry(EventKind.HEARD, place) for place, port in enumerate(node.inputs)}
+        } | {port.name: _entry(EventKind.EXTERNAL, place) for place, port in enumerate(node.inputs)}
         self._acknowledgement_entries = {
             connection: _entry(EventKind.ACKNOWLEDGEMENT, connection.index)
             for connection in connections
         }
 
     def start(self, *, awaits_others: bool = False) -> None:
-        self._note(_entry(EventKind.START, int(awaits_others)))
+        self._record(_entry(EventKind.START, int(awaits_others)))
         super().start(awaits_others=awaits_others)
 
     def activate(self) -> None:
-        self._note(_entry(EventKind.ACTIVATE))
+        self._record(_entry(EventKind.ACTIVATE))
         super().activate()
 
     def on_packet(self, key: Connection | str, packet: Any) -> None:
-        self._note(self._packet_entries[key])
+        self._record(self._packet_entries[key])
         super().on_packet(key, packet)
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
-        self._note(self._acknowledgement_entries[connection] - (position << _POSITION_SHIFT))
+        self._record(self._acknowledgement_entries[connection] - (position << _POSITION_SHIFT))
         super().on_acknowledgement(connection, position)
 
     def on_registered(self, connection: Connection) -> None:
-        self._note(_entry(EventKind.REGISTERED, connection.index))
+        self._record(_entry(EventKind.REGISTERED, connection.index))
         super().on_registered(connection)
 
     def on_timer(self) -> None:
-        self._note(_TIMER)
+        self._record(_TIMER)
         super().on_timer()
 
     def on_loop_back(self) -> None:
-        self._note(_LOOP_BACK)
+        self._record(_LOOP_BACK)
         super().on_loop_back()
 
     def offer(self, packets: Mapping[str, Any], accepted: Callable[[], None]) -> Callable[[], None]:
-        self._note(_OFFER)
+        self._record(_OFFER)
         return super().offer(packets, accepted)
 
     def drain(self, last_round: Sequence[int] = ()) -> None:
         for place in last_round:
-            self._note(_entry(EventKind.LAST_ROUND, place))
-        self._note(_entry(EventKind.DRAIN))
+            self._record(_entry(EventKind.LAST_ROUND, place))
+        self._record(_entry(EventKind.DRAIN))
         super().drain(last_round)
 
     def pause(self) -> None:
-        self._note(_entry(EventKind.PAUSE))
+        self._record(_entry(EventKind.PAUSE))
         super().pause()
 
     def resume(self) -> None:
         if not self._lifecycle.is_draining:  # a drain resumes by itself, here and in the replay
-            self._note(_entry(EventKind.RESUME))
+            self._record(_entry(EventKind.RESUME))
         super().resume()
 
     def step(self, count: int, *, is_driven: bool) -> None:
-        self._note(_entry(EventKind.STEP, int(is_driven), count))
+        self._record(_entry(EventKind.STEP, int(is_driven), count))
         super().step(count, is_driven=is_driven)
 
     def stop_hooks(self) -> None:
         super().stop_hooks()
-        self._note(_entry(EventKind.STOP))
+        self._record(_entry(EventKind.STOP))
 
     def _pass(self) -> None:
         if not self._is_passing:
@@ -157,31 +170,12 @@ class LoggedEngine(Engine):
         self._starts += 1
         entry = self._hook_entries.get(hook)  # packets from a plugin's thread have none
         if entry is not None:
-            self._note(entry)
+            self._record(entry)
         super()._run(hook)
-
-    def _noting_deferral(self, has_taken_in: Callable[[], bool]) -> Callable[[], bool]:
-        def noted() -> bool:
-            is_in = has_taken_in()
-            if not is_in:
-                self._note(_entry(EventKind.DEFERRED, position=self._starts))
-            return is_in
-
-        return noted
-
-    def _noting(self, clock: Callable[[], int]) -> Callable[[], int]:
-        note = self._note
-
-        def noted() -> int:
-            now_ns = clock()
-            note(now_ns)
-            return now_ns
-
-        return noted
 
 
 def events_of(event_log: Iterable[int]) -> Iterator[Event]:
-    """The events of a log; the first, ``BEGIN``, has the readings before all others."""
+    """The events of a log; the first, ``BEGIN``, has the readings before all events."""
     event = Event(EventKind.BEGIN, 0, 0, [])
     for number in event_log:
         if number >= 0:
@@ -197,19 +191,19 @@ def events_of(event_log: Iterable[int]) -> Iterator[Event]:
 
 
 def starts_of(event_log: Iterable[int]) -> Iterator[int]:
-    """The hooks that have started, by their places in the order of declaration."""
+    """The started hooks, as places in the order of declaration."""
     for number in event_log:
         if number < 0 and (~number & _mask(_KIND_BITS)) == EventKind.HOOK:
             yield _parts(number)[1]
 
 
 def is_whole(event_log: Iterable[int]) -> bool:
-    """Whether it goes to the end of the run."""
+    """Whether a log reaches the end of the run."""
     return _entry(EventKind.STOP) in event_log
 
 
 def is_understood(event_log: Iterable[int]) -> bool:
-    """Whether every entry is of a kind that there is."""
+    """Whether every entry is of a known kind."""
     kinds = {~number & _mask(_KIND_BITS) for number in event_log if number < 0}
     return kinds <= {*map(int, EventKind)}
 
@@ -233,10 +227,9 @@ _TIMER, _LOOP_BACK, _OFFER = map(_entry, (EventKind.TIMER, EventKind.LOOP_BACK, 
 
 # ---------------------------------------------------------------------- replay
 #
-# Replays an event log: an engine gets the events of a recorded run again, in their order.
-#
-# Neighbours, timers and the wall clock are those of the log. The plugin runs anew, so it may
-# differ from the log: then the replay says where, and guesses nothing.
+# An engine gets the events of a recorded run again, in their order. Neighbours, timers and the wall
+# clock are those of the log. The plugin runs anew and may differ from the log: then the replay ends
+# and names the difference.
 
 
 _NO_START = -1
@@ -250,18 +243,18 @@ class ReplayParted(Exception):
     """The replay cannot go on as the run did; the text says why."""
 
 
-class Source(Protocol):
+class RecordedArrivals(Protocol):
     """The packets of a recorded run, which the event log does not hold."""
 
     def packet(self, key: Connection | str, number: int) -> Any:
-        """The packet that arrived as the ``number``-th (from 1) there; raises ``ReplayOver``."""
+        """The ``number``-th packet (from 1) of a connection or input; raises ``ReplayOver``."""
 
     def offer(self) -> None:
-        """Have the plugin's thread offer packets, as soon as it does; raises ``ReplayParted``."""
+        """Wait until the plugin's thread offers packets; raises ``ReplayParted``."""
 
 
-class Inbox(Protocol):
-    """The node that takes the events to its engine."""
+class EventHandler(Protocol):
+    """The node, which hands the events to its engine."""
 
     def start(self, *, awaits_others: bool = False) -> None: ...
     def activate(self) -> None: ...
@@ -282,8 +275,8 @@ class Script:
 
     Attributes:
         started: how many hooks have started.
-        deliveries: packets of the node to itself that are on their way.
-        loop_back: the one that is on its way, if any.
+        deliveries: packets of the node to itself that have not arrived.
+        loop_back: the posted one, if any.
     """
 
     def __init__(self, event_log: array[int]) -> None:
@@ -299,16 +292,16 @@ class Script:
         self.loop_back: Callable[[], None] | None = None
 
     def clock(self) -> int:
-        """The reading of the clock at this point, or else the last one."""
+        """The next reading of the clock in the log, or else the last one."""
         self._now_ns = next(self._readings, self._now_ns)
         return self._now_ns
 
     def may_start(self) -> bool:
-        """Whether a ready hook starts now, rather than after what had arrived at this point."""
+        """Whether a ready hook starts now, and not after further arrivals."""
         return self._limit is None or self._in_event < self._limit
 
-    def note_start(self) -> None:
-        """A hook starts, or packets from a thread of the plugin leave."""
+    def record_start(self) -> None:
+        """Count a start of a hook, or packets sent from a thread of the plugin."""
         self._in_event += 1
 
     def events(self) -> Iterator[Event]:
@@ -324,10 +317,11 @@ class Script:
         return self._next != _NO_START
 
     def check_start(self, place: int, names: Mapping[int, str]) -> None:
-        """A hook is about to start: whether it did in the log, too.
+        """Check the start of a hook against the log.
 
         Raises:
-            ReplayOver, ReplayParted: if not.
+            ReplayOver: if the log has no further start.
+            ReplayParted: if another hook started in the run.
         """
         if self._next == _NO_START:
             raise ReplayOver
@@ -342,7 +336,7 @@ class Script:
 
 
 class ReplayedEngine(Engine):
-    """Starts hooks where the log has them start, and nowhere else; its clock is the script's."""
+    """An engine that starts the hooks of the log only; its clock is the script's."""
 
     def __init__(
         self,
@@ -369,14 +363,16 @@ class ReplayedEngine(Engine):
         place = self._places.get(hook)
         if place is not None:
             self._script.check_start(place, self._names)
-        self._script.note_start()
+        self._script.record_start()
         super()._run(hook)
 
 
 class Player:
-    """Takes a node through a script, event by event."""
+    """Plays a script to a node, event by event."""
 
-    def __init__(self, script: Script, engine: Engine, inbox: Inbox, source: Source) -> None:
+    def __init__(
+        self, script: Script, engine: Engine, inbox: EventHandler, source: RecordedArrivals
+    ) -> None:
         self._script, self._engine, self._inbox, self._source = script, engine, inbox, source
         self._arrived: dict[Connection | str, int] = {}
         self._last_round: list[int] = []
@@ -384,20 +380,24 @@ class Player:
         self._connections = {key.index: key for key in ends if isinstance(key, Connection)}
 
     def play(self, event: Event) -> None:
-        """Let an event happen.
+        """Play an event.
 
         Raises:
-            ReplayOver, ReplayParted: if the replay ends with it.
+            ReplayOver, ReplayParted: if the replay ends here.
         """
         kind = event.kind
         if kind is EventKind.PACKET:
-            self._packet(self._connections[event.place])
+            connection = self._connections[event.place]
+            if connection.source_node != connection.destination_node:
+                self._inbox.on_packet(connection, self._arriving(connection))
+            elif self._script.deliveries:
+                self._script.deliveries.popleft()()
         elif kind is EventKind.ACKNOWLEDGEMENT:
             connection = self._connections[event.place]
-            # A plugin that was changed may have sent less.
+            # A changed plugin may have sent less.
             position = min(event.position, self._engine.send_windows[connection].sent)
             self._inbox.on_acknowledgement(connection, position)
-        elif kind is EventKind.HEARD:
+        elif kind is EventKind.EXTERNAL:
             port = self._engine.node.inputs[event.place]
             self._inbox.on_external_packet(port, self._arriving(port.name))
         elif kind is EventKind.REGISTERED:
@@ -413,7 +413,7 @@ class Player:
         elif kind is EventKind.STEP:
             self._inbox.step(event.position, is_driven=bool(event.place))
         elif kind is EventKind.LAST_ROUND:
-            if event.place < len(self._engine.all_hooks):  # a plugin that was changed may have less
+            if event.place < len(self._engine.all_hooks):  # a changed plugin may have less
                 self._last_round.append(event.place)
         elif kind is EventKind.DRAIN:
             self._inbox.drain(self._last_round)
@@ -425,12 +425,6 @@ class Player:
                 EventKind.RESUME: self._inbox.resume,
                 EventKind.STOP: self._inbox.stop,
             }[kind]()
-
-    def _packet(self, connection: Connection) -> None:
-        if connection.source_node != connection.destination_node:
-            self._inbox.on_packet(connection, self._arriving(connection))
-        elif self._script.deliveries:
-            self._script.deliveries.popleft()()
 
     def _arriving(self, key: Connection | str) -> Any:
         number = self._arrived[key] = self._arrived.get(key, 0) + 1

@@ -5,28 +5,30 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from neuros.engine.input_queue import HookInput, InputQueue
+from neuros.engine.input_queue import HookInput
 from neuros.engine.metrics import TickIntervals
 from neuros.engine.node_ports import Output
 from neuros.engine.send_window import SendWindow
 from neuros.errors import HookError, WrongValue
 from neuros.hooks import HookKind, HookSpec, OutputSpec
+from neuros.project.suggest import counted
 
-_SEVERAL = (tuple, list)  # as a union it would be made anew at each use
+_SEVERAL = (tuple, list)  # each use of a union would create it anew
 
 
 class Hook:
-    """A hook and its state; readiness is kept up to date by counting, not by looking.
+    """A hook and its state. Counters keep its readiness up to date.
 
     Attributes:
-        blocked: number of its send windows that are blocked now.
-        is_due: False only for a tick between two due times, and for a source with nothing to send.
-        is_enabled: whether the phase of the node's lifecycle lets it run at all.
+        blocked: number of its blocked send windows.
+        is_due: False for a tick between due times, and for a source with nothing to send.
+        is_enabled: whether the phase of the node lets the hook run.
         turn: grows in the order of priority: least recently executed first.
         candidates: of the whole node, the hooks that are enabled, due and have all inputs; each
-            keeps itself in there, so that no event has to look at all the others.
-        executions, busy_ns: how often it ran, and for how long in all.
-        ticks: the intervals between its starts, if it has a period.
+            hook adds and removes itself.
+        executions: their number.
+        busy_ns: their duration in all.
+        ticks: the intervals between starts, of a hook with a period.
     """
 
     __slots__ = (
@@ -74,39 +76,46 @@ class Hook:
         self.missed_ticks = 0
         self.period_ns = 0 if spec.period_s is None else max(1, round(spec.period_s * 1e9))
         self.ticks = TickIntervals(self.period_ns) if self.period_ns else None
-        self.loops = tuple(self._loops())
+        # The connections from this hook to itself.
+        self.loops = tuple(
+            (window, hook_input, queue)
+            for window in self._windows
+            for hook_input in self.inputs
+            for queue in hook_input.queues
+            if queue.subscription.key is window.connection
+        )
         for window in self._windows:
             window.hooks.append(self)
             self.blocked += window.is_blocked
 
     @property
     def is_due(self) -> bool:
-        """Whether the timer condition holds."""
+        """Whether the timer lets the hook run."""
         return self._is_due
 
     @is_due.setter
     def is_due(self, is_due: bool) -> None:
         self._is_due = is_due
-        self._note()
+        self._update_candidates()
 
     @property
     def is_enabled(self) -> bool:
-        """Whether the phase of the node lets it run."""
+        """Whether the phase of the node lets the hook run."""
         return self._is_enabled
 
     @is_enabled.setter
     def is_enabled(self, is_enabled: bool) -> None:
         self._is_enabled = is_enabled
-        self._note()
+        self._update_candidates()
 
     def on_input_complete(self) -> None:
-        """One of its inputs has now what it needs."""
+        """An input of the hook has all packets that it needs."""
         self._lacking -= 1
         if not self._lacking and self._is_enabled and self._is_due:
             self.candidates.add(self)
 
     def on_input_incomplete(self) -> None:
-        """One of its inputs lacks something now."""
+        """An input of the hook lacks a packet."""
         self._lacking += 1
         self.candidates.discard(self)
 
@@ -115,35 +124,35 @@ class Hook:
         return list(self._windows)
 
     def is_ready(self) -> bool:
-        """Whether it may start now: input, output and timer condition, and the node's phase."""
+        """Whether the hook may start now, by inputs, outputs, timer and the node's phase."""
         if not (self.is_enabled and self.is_due) or self.missing_input() is not None:
             return False
         return not self.blocked or self.can_send()
 
     def can_send(self) -> bool:
-        """Whether no send window is blocked, but for packets that its own start would take."""
+        """Whether no send window is blocked, but by packets that its own start would consume."""
         if not self.blocked:
             return True
         return bool(self.loops) and len(self._freed_windows()) == self.blocked
 
     def awaited_input(self) -> HookInput | None:
-        """The first of its required inputs that has no packet, if that is all it waits for."""
+        """The first required input without a packet, if the hook waits for inputs alone."""
         return self.missing_input() if self._lacking and self._is_enabled and self._is_due else None
 
     def missing_input(self) -> HookInput | None:
-        """The first of its required inputs that has no packet."""
-        for hook_input in self.inputs:  # a loop, since next() over a generator takes thrice as long
+        """The first required input without a packet."""
+        for hook_input in self.inputs:  # next() over a generator takes thrice as long
             if hook_input.missing:
                 return hook_input
         return None
 
     def blocking_windows(self) -> list[SendWindow]:
-        """The send windows that hold it up."""
+        """The send windows that keep the hook from running."""
         freed = self._freed_windows() if self.loops else ()
         return [window for window in self._windows if window.is_blocked and window not in freed]
 
     def has_reliable_packet(self) -> bool:
-        """Whether a packet that must not be lost waits for it."""
+        """Whether a packet of a reliable connection waits for the hook."""
         return any(hook_input.has_reliable_packet() for hook_input in self.inputs)
 
     def set_due(self, start_ns: int, now_ns: int) -> None:
@@ -155,20 +164,20 @@ class Hook:
         self.is_due = False
 
     def postpone(self, duration_ns: int) -> None:
-        """For a tick: a time has passed that does not count."""
+        """Move the next due time of a tick by a duration that does not count."""
         self.due_ns += duration_ns
         if self.ticks is not None:
             self.ticks.skip(duration_ns)
 
     def packets_of(self, result: Any) -> Sequence[tuple[Output, Any]]:
-        """The packets that a hook returned, as they are sent, each with its output.
+        """The packets to be sent for the result of the hook, each with its output.
 
         Raises:
-            HookError: if the count, a type, a missing packet, or a value in one is not as declared.
+            HookError: if the count, a type or a value is wrong, or a required packet is missing.
         """
         results = self._results
         if len(results) == 1 and result is not None and not isinstance(result, _SEVERAL):
-            packets: Sequence[Any] = (result,)  # as most hooks return
+            packets: Sequence[Any] = (result,)  # the result of most hooks
         elif not results:
             if result is not None:
                 raise self.error(f"returned {_kind(result)}, but declares no outputs")
@@ -180,8 +189,8 @@ class Hook:
         if len(packets) != len(results):
             names = ", ".join(output.port.name for output in self.outputs)
             raise self.error(
-                f"returned {_count(len(packets), 'packet')}, but declares"
-                f" {_count(len(results), 'output')} ({names})"
+                f"returned {counted(len(packets), 'packet')}, but declares"
+                f" {counted(len(results), 'output')} ({names})"
             )
         found = []
         for (output, is_optional), packet in zip(results, packets):  # noqa: B905, it costs time
@@ -209,46 +218,37 @@ class Hook:
         return found
 
     def error(self, text: str) -> HookError:
-        """A ``HookError`` with the address of this hook."""
+        """A ``HookError`` with the name and line of this hook."""
         return HookError(text, hook=self.name, where=self.spec.where)
 
-    def _note(self) -> None:
+    def _update_candidates(self) -> None:
         if self._is_enabled and self._is_due and not self._lacking:
             self.candidates.add(self)
         else:
             self.candidates.discard(self)
 
-    def _loops(self) -> list[tuple[SendWindow, HookInput, InputQueue]]:
-        """Connections from this hook to itself."""
-        return [
-            (window, hook_input, queue)
-            for window in self._windows
-            for hook_input in self.inputs
-            for queue in hook_input.queues
-            if queue.subscription.key is window.connection
-        ]
-
     def _freed_windows(self) -> list[SendWindow]:
-        """The blocked ones of its send windows whose packets its own start would acknowledge."""
+        """The blocked send windows that a start of the hook would free: loops to itself."""
         return [
             window
             for window, hook_input, queue in self.loops
             if window.is_blocked
-            and hook_input.would_take(queue)
-            and window.frees(queue.subscription.position_if_taken(queue))
+            and hook_input.would_consume(queue)
+            and window.frees(queue.subscription.position_if_consumed(queue))
         ]
 
 
 class Source(Hook):
-    """Packets from outside the hooks (a simulator's own thread), sent as if a hook returned them.
+    """A hook in the place of a thread (of a simulator), which offers packets for its outputs.
 
-    It is due while it holds an offer; several wait in line. ``where`` is the plugin's file.
+    A source is due while it holds offers, which it sends in their order. ``where``: the plugin's
+    file.
     """
 
     __slots__ = ("_accepted", "_offers", "_where")
 
     def __init__(self, names: Sequence[str], outputs: Mapping[str, Output], where: str) -> None:
-        spec = HookSpec(HookKind.FUNCTION, _offer, (), tuple(OutputSpec(name) for name in names))
+        spec = HookSpec(HookKind.FUNCTION, _nothing, (), tuple(OutputSpec(name) for name in names))
         super().__init__(spec, (), outputs)
         self.name = f"submit({', '.join(names)})"
         self._where = where
@@ -257,7 +257,7 @@ class Source(Hook):
         self.is_due = False
 
     def offer(self, packets: Sequence[Any], accepted: Callable[[], None]) -> Callable[[], None]:
-        """Hold packets, one per output, until the engine takes them; returns how to withdraw."""
+        """Add packets, one per output; returns a function that withdraws them."""
         ticket = object()
         self._offers[ticket] = (packets, accepted)
         self.is_due = True
@@ -268,14 +268,14 @@ class Source(Hook):
 
         return withdraw
 
-    def take(self) -> Sequence[Any]:
-        """Give away the oldest offer."""
+    def consume(self) -> Sequence[Any]:
+        """Remove and return the packets of the oldest offer."""
         packets, self._accepted = self._offers.pop(next(iter(self._offers)))
         self.is_due = bool(self._offers)
         return packets
 
     def accept(self) -> None:
-        """Report that the offer taken last has been sent."""
+        """Report that the packets removed last have been sent."""
         accepted, self._accepted = self._accepted, _nothing
         accepted()
 
@@ -284,18 +284,10 @@ class Source(Hook):
         return HookError(text, hook=self.name, where=self._where)
 
 
-def _offer() -> None:
-    """Stands for the function of a :class:`Source`."""
-
-
 def _nothing() -> None:
-    """The callback of no offer."""
+    """The function of a source, and the callback of no offer."""
 
 
 def _kind(value: object) -> str:
     kind = type(value)
     return kind.__name__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__name__}"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"

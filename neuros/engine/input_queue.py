@@ -1,9 +1,8 @@
 """The receiving end of a connection: input queues, and the packets that hooks have started on.
 
-A :class:`Subscription` is one connection (or external topic) at its receiver. Every hook that takes
-the input has an :class:`InputQueue` of its own there, and every hook gets every packet. A
-:class:`HookInput` is one declared input of one hook: a single queue mostly, several where an
-input is fed by several connections.
+A :class:`Subscription` is a connection (or external topic) at its receiver. Each hook that declares
+the input has an :class:`InputQueue` there, and each gets every packet. A :class:`HookInput` is a
+declared input of a hook: mostly a single queue, several if several connections feed the input.
 """
 
 from __future__ import annotations
@@ -19,30 +18,30 @@ from neuros.hooks import InputSpec
 from neuros.project.model import Connection
 
 
-class Taker(Protocol):
-    """A hook, as its inputs see it."""
+class Consumer(Protocol):
+    """A hook, for its inputs."""
 
     name: str
     missed_ticks: int
 
     def is_ready(self) -> bool:
-        """Whether it may start now."""
+        """Whether the hook may start now."""
 
     def on_input_complete(self) -> None:
-        """One of its inputs has now what it needs."""
+        """An input of the hook has all packets that it needs."""
 
     def on_input_incomplete(self) -> None:
-        """One of its inputs lacks something now."""
+        """An input of the hook lacks a packet."""
 
 
 class InputQueue:
-    """The packets of one subscription that have arrived and that one hook has not started on yet.
+    """The packets of a subscription that have arrived, and that one hook has not started on.
 
     Attributes:
-        packets: ``(arrival, position, packet)``, oldest first; ``arrival`` orders the packets of
-            the whole node, ``position`` counts from 1 on this subscription.
-        position: of the last packet that the hook started on, 0 before.
-        passed: of the last packet that the hook started on or lost.
+        packets: ``(arrival, position, packet)``, oldest first; ``arrival`` counts the packets of
+            the node, ``position`` those of the subscription, both from 1.
+        position: of the last packet that the hook started on, at first 0.
+        passed: position of the last packet that the hook started on or lost.
     """
 
     __slots__ = ("discards_in_a_row", "hook_input", "packets", "passed", "position", "subscription")
@@ -57,20 +56,23 @@ class InputQueue:
 
 
 class Subscription:
-    """One connection or external topic at its receiver.
+    """A connection or external topic at its receiver.
 
     Args:
-        key: the connection, or the name of the input that an external topic is bound to.
+        key: the connection, or the name of the input of an external topic.
         name: for messages.
-        input_name: the input of the node that it feeds.
-        capacity: unread packets per queue.
-        is_lossless: whether a full queue is a fault of the sender rather than a discard.
+        input_name: the input that the packets feed.
+        capacity: most unread packets per queue.
+        is_lossless: whether a full queue is an error of the sender, and not a discard.
         is_acknowledged: whether the sender waits for acknowledgements.
 
     Attributes:
-        acknowledge: tells the sender a position.
-        taken, taken_ns: the position of each packet that a hook has started on, and when that was,
-            until the packet log takes these away.
+        acknowledge: sends a position to the sender.
+        consumed: packets that every hook has passed, and none has lost.
+        discarded: packets that a hook has lost.
+        counted: position up to which packets are consumed or discarded.
+        taken: position of each packet that a hook has started on; the packet log empties it.
+        taken_ns: times of these starts.
     """
 
     __slots__ = (
@@ -78,6 +80,7 @@ class Subscription:
         "acknowledged",
         "capacity",
         "consumed",
+        "counted",
         "discarded",
         "input_name",
         "is_acknowledged",
@@ -87,7 +90,6 @@ class Subscription:
         "name",
         "queues",
         "received",
-        "settled",
         "skipped",
         "taken",
         "taken_ns",
@@ -116,14 +118,14 @@ class Subscription:
         self.discarded = 0
         self.longest_discard = 0
         self.acknowledged = 0
-        self.settled = 0
+        self.counted = 0
         self.skipped: set[int] = set()
         self.taken = array("q")
         self.taken_ns = array("q")
 
     @property
     def is_external(self) -> bool:
-        """Whether it is a plain ROS topic, and so can bring a packet at any time."""
+        """Whether packets come from a plain ROS topic, at any time."""
         return isinstance(self.key, str)
 
     @property
@@ -134,11 +136,11 @@ class Subscription:
 
     @property
     def unread(self) -> int:
-        """Packets that some taker has still to start on, and that none has lost."""
+        """Packets that no hook has lost, and some hook has not started on."""
         return self.received - self.consumed - self.discarded
 
     def put(self, arrival: int, packet: Any) -> None:
-        """Deliver a packet to every taker; without takers, acknowledge it.
+        """Deliver a packet to each queue; without queues, acknowledge it.
 
         Raises:
             ProtocolError: if the queue of a lossless connection is full.
@@ -152,11 +154,11 @@ class Subscription:
             if len(packets) == 1:
                 queue.hook_input.on_filled()
         if not self.queues:
-            self._settle()
-            self.acknowledge_taken()
+            self._count_passed()
+            self.acknowledge_consumed()
 
-    def take(self, queue: InputQueue, now_ns: int) -> Any:
-        """The oldest packet of ``queue``, whose hook starts on it now; it is acknowledged."""
+    def consume(self, queue: InputQueue, now_ns: int) -> Any:
+        """Remove, return and acknowledge the oldest packet of ``queue``: its hook starts on it."""
         _, position, packet = queue.packets.popleft()
         if not queue.packets:
             queue.hook_input.on_emptied()
@@ -165,32 +167,32 @@ class Subscription:
         self.taken_ns.append(now_ns)
         queue.discards_in_a_row = 0
         if len(self.queues) == 1:
-            self.settled = position
+            self.counted = position
             self.consumed += 1
         else:
-            self._settle()
-        self.acknowledge_taken()
+            self._count_passed()
+        self.acknowledge_consumed()
         return packet
 
     def remove(self, queue: InputQueue) -> None:
-        """Forget a taker: its hook will never run again."""
+        """Remove the queue of a hook that will never run again."""
         self.queues.remove(queue)
         queue.packets.clear()
-        self._settle()
-        self.acknowledge_taken()
+        self._count_passed()
+        self.acknowledge_consumed()
 
-    def acknowledge_taken(self) -> None:
-        """Tell the sender what every taker has started on, if that has grown."""
+    def acknowledge_consumed(self) -> None:
+        """Acknowledge the packets that every hook has started on, if there are new ones."""
         if self.is_acknowledged:
-            position = self.position_if_taken()
+            position = self.position_if_consumed()
             if position > self.acknowledged:
                 self.acknowledged = position
                 self.acknowledge(position)
 
-    def position_if_taken(self, queue: InputQueue | None = None) -> int:
-        """Smallest position over all takers, if ``queue`` had started on its oldest packet."""
+    def position_if_consumed(self, queue: InputQueue | None = None) -> int:
+        """The smallest position of all queues, as if ``queue`` had consumed its oldest packet."""
         queues = self.queues
-        if len(queues) == 1 and queue is None:  # as nearly always
+        if len(queues) == 1 and queue is None:  # the common case
             return queues[0].position
         if not queues:
             return self.received
@@ -213,31 +215,31 @@ class Subscription:
         if position not in self.skipped:
             self.skipped.add(position)
             self.discarded += 1
-        self._settle()
+        self._count_passed()
         if queue.packets:
             queue.hook_input.on_discarded()
 
-    def _settle(self) -> None:
-        """Count what every taker is past: discarded if one of them lost it, consumed otherwise."""
+    def _count_passed(self) -> None:
+        """Count the packets that every hook has passed: consumed, unless one has lost them."""
         front = min((queue.passed for queue in self.queues), default=self.received)
-        for position in range(self.settled + 1, front + 1):
+        for position in range(self.counted + 1, front + 1):
             if position in self.skipped:
                 self.skipped.discard(position)
             else:
                 self.consumed += 1
-        self.settled = max(self.settled, front)
+        self.counted = max(self.counted, front)
 
 
 def _nowhere(position: int) -> None:
-    """Acknowledges on a connection without acknowledgements."""
+    """``acknowledge`` of a connection without acknowledgements."""
 
 
 class HookInput:
-    """One declared input of one hook.
+    """A declared input of a hook.
 
     Attributes:
-        missing: number of packets that are still needed before its hook may start.
-        hook: told when the input has all that it needs, or no longer.
+        missing: number of packets that the hook still needs here.
+        hook: is called when ``missing`` becomes 0, and when it no longer is.
     """
 
     __slots__ = ("_filled", "hook", "is_all", "is_optional", "missing", "name", "queues", "rest")
@@ -252,10 +254,10 @@ class HookInput:
             queue.subscription.queues.append(queue)
         self._filled = 0
         self.missing = self._count()
-        self.hook: Taker
+        self.hook: Consumer
 
     def on_filled(self) -> None:
-        """One of the queues is no longer empty."""
+        """A queue is no longer empty."""
         self._filled += 1
         if self.missing:
             self.missing = self._count()
@@ -263,14 +265,14 @@ class HookInput:
                 self.hook.on_input_complete()
 
     def on_emptied(self) -> None:
-        """One of the queues is empty now."""
+        """A queue is empty."""
         self._filled -= 1
         was_missing, self.missing = self.missing, self._count()
         if self.missing and not was_missing:
             self.hook.on_input_incomplete()
 
     def on_discarded(self) -> None:
-        """The oldest packet of a queue was discarded, and others are there."""
+        """The oldest packet of a queue was discarded, and further packets are there."""
 
     def _count(self) -> int:
         if self.is_optional:
@@ -280,26 +282,26 @@ class HookInput:
         return 0 if self._filled else 1
 
     def has_reliable_packet(self) -> bool:
-        """Whether a packet that must not be lost waits here."""
+        """Whether a packet of a reliable connection waits here."""
         return self._filled > 0 and any(
             queue.packets and queue.subscription.is_acknowledged for queue in self.queues
         )
 
     def could_be_filled_from_outside(self) -> bool:
-        """Whether external topics alone could bring all that it still needs."""
+        """Whether external topics alone could bring the missing packets."""
         return self.missing <= sum(
             queue.subscription.is_external and not queue.packets for queue in self.queues
         )
 
     def has_waited(self, arrival: int) -> bool:
-        """Whether what it needs of an external topic had come by then."""
+        """Whether the needed packets of external topics came up to ``arrival``."""
         return self.is_optional or not any(
             queue.subscription.is_external and queue.packets and queue.packets[0][0] > arrival
             for queue in self.queues
         )
 
     def chosen(self) -> InputQueue | None:
-        """For a plain input: the queue whose oldest packet has waited longest."""
+        """The queue of a plain input whose oldest packet has waited longest."""
         if len(self.queues) == 1:
             queue = self.queues[0]
             return queue if queue.packets else None
@@ -309,13 +311,13 @@ class HookInput:
             default=None,
         )
 
-    def would_take(self, queue: InputQueue) -> bool:
-        """Whether a start of the hook now would take from ``queue``."""
+    def would_consume(self, queue: InputQueue) -> bool:
+        """Whether a start of the hook would consume a packet of ``queue``."""
         return bool(queue.packets) and (self.is_all or self.chosen() is queue)
 
-    def take(self, now_ns: int) -> Any:
-        """The argument for the hook, which starts now."""
+    def consume(self, now_ns: int) -> Any:
+        """The argument for the hook, which starts."""
         if not self.is_all:
             queue = self.chosen()
-            return None if queue is None else queue.subscription.take(queue, now_ns)
-        return [q.subscription.take(q, now_ns) if q.packets else None for q in self.queues]
+            return None if queue is None else queue.subscription.consume(queue, now_ns)
+        return [q.subscription.consume(q, now_ns) if q.packets else None for q in self.queues]

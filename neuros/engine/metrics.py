@@ -1,7 +1,6 @@
 """Metrics of an engine: the states that its wall time is counted by, and intervals of ticks.
 
-Between two events nothing of a node changes, so the time between them has one cause, which is
-asked for once, when the next event arrives.
+Between two events the state of a node does not change, so the time between them has one cause.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from math import sqrt
 from typing import Any, NamedTuple
 
 WITHIN_MS = (1, 2, 5, 10)
-"""Shares are given of intervals that are off the period by no more than this."""
+"""Limits of the error of an interval, for which figures have the share of intervals."""
 
 _BIN_NS = 100_000
 _MOST_BINS = 20_000
@@ -31,7 +30,7 @@ class State(str, Enum):
     SCHEDULING = "scheduling"
     PAUSED = "paused"
 
-    __hash__ = str.__hash__  # time is counted at every event, and Enum's own is ten times slower
+    __hash__ = str.__hash__  # used at every event; Enum's own is ten times slower
 
 
 class Rest(NamedTuple):
@@ -50,11 +49,11 @@ PAUSED = Rest(State.PAUSED)
 def in_flight_and_lost(
     sent: int, received: int, outstanding: int, has_drained: bool
 ) -> tuple[int, int]:
-    """Packets of a connection that had not arrived when a run ended: in flight, and lost.
+    """The packets of a connection that had not arrived at the end of a run: in flight, and lost.
 
-    Nodes of a run that is not drained stop one after the other, and what one sends to another that
-    has stopped arrives nowhere. Only outstanding packets can be among these: all others of a
-    reliable connection have arrived, and on one of best effort nobody can tell the two apart.
+    Nodes of a run that does not drain stop one after the other, and a packet to a stopped node is
+    in flight for ever. Only outstanding packets can be: the others of a reliable connection have
+    arrived, and on a best-effort connection the two cannot be told apart.
     """
     missing = sent - received
     in_flight = 0 if has_drained else max(0, min(missing, outstanding))
@@ -62,10 +61,10 @@ def in_flight_and_lost(
 
 
 class TickIntervals:
-    """Intervals between the starts of one timed hook, in a memory that does not grow with them.
+    """Statistics of the intervals between the starts of a timed hook, in constant memory.
 
     Args:
-        period_ns: what the intervals should be.
+        period_ns: the nominal interval.
     """
 
     __slots__ = (
@@ -91,7 +90,7 @@ class TickIntervals:
         self._within = [0] * len(WITHIN_MS)
         self._bins: Counter[int] = Counter()
 
-    def note(self, start_ns: int) -> None:
+    def record(self, start_ns: int) -> None:
         """The hook starts."""
         last_ns, self._last_ns = self._last_ns, start_ns
         if last_ns is None:
@@ -111,15 +110,15 @@ class TickIntervals:
         self._bins[min(interval_ns // _BIN_NS, _MOST_BINS)] += 1
 
     def skip(self, duration_ns: int) -> None:
-        """Leave a time out of the current interval."""
+        """Leave a duration out of the current interval."""
         if self._last_ns is not None:
             self._last_ns += duration_ns
 
     def figures(self) -> dict[str, Any] | None:
-        """Statistics of the intervals, ready for JSON; ``None`` before the second tick.
+        """The statistics, ready for JSON; ``None`` before the second tick.
 
-        ``histogram`` is a list of ``[from_ms, count]``, in bins of 0.1 ms; what is above 2 s is in
-        the last one. ``largest_error_ms`` is how far the worst interval was off the period.
+        ``histogram`` is a list of ``[from_ms, count]`` in bins of 0.1 ms; the last bin has all
+        intervals above 2 s. ``largest_error_ms`` is the largest difference from the period.
         """
         count = self.count
         if not count:
@@ -148,21 +147,20 @@ class TickIntervals:
 
 # ---------------------------------------------------------------------- time budget
 #
-# Time budget of a node: its share of executing, waiting, blocked and idle time.
-#
-# That time counts from when the last node had initialised until the end was asked for
-# (``running_s`` of ``run.json``). A node executes its hooks, waits for input, is blocked by an
-# output, or idles between ticks. What is missing to all of the time is scheduling: a hook may
-# start, and its turn has not come. In process that is where the hooks of other nodes run.
+# The budget covers the time from the end of the last initialisation until the end of the run was
+# requested (``running_s`` of ``run.json``). Scheduling time is that in which a hook may start, and
+# waits for its turn: in one process, hooks of other nodes run then.
 
 
 @dataclass(frozen=True)
 class TimeBudget:
-    """One node's wall time while the run was under way, in seconds.
+    """The wall time of a node, in seconds.
 
     Attributes:
-        executing: by hook; waiting: by input; blocked: by connection.
-        own_s: needed by the node itself, whatever the others do.
+        executing: by hook.
+        waiting: by input.
+        blocked: by connection.
+        idle_s: between ticks.
     """
 
     executing: Mapping[str, float]
@@ -173,32 +171,32 @@ class TimeBudget:
 
     @property
     def executing_s(self) -> float:
-        """All hooks together."""
+        """Seconds of all hooks."""
         return sum(self.executing.values())
 
     @property
     def own_s(self) -> float:
-        """Hooks and scheduling."""
+        """Seconds of hooks and scheduling, which do not depend on other nodes."""
         return self.executing_s + self.scheduling_s
 
     @property
     def busiest_hook(self) -> tuple[str, float]:
-        """The hook that executes longest, and its seconds; an empty name if there is none."""
+        """The hook with most seconds, and these; an empty name if there is none."""
         return max(self.executing.items(), key=lambda item: item[1], default=("", 0.0))
 
     @property
     def total_s(self) -> float:
-        """All of it."""
+        """The sum."""
         rest = sum(self.waiting.values()) + sum(self.blocked.values()) + self.idle_s
         return self.own_s + rest
 
     def share(self, seconds: float) -> float:
-        """Seconds as a share of all of it, from 0 to 1."""
+        """Seconds as a share of the sum, from 0 to 1."""
         return seconds / (self.total_s or 1.0)
 
     @property
     def shares(self) -> dict[str, float]:
-        """Executing, waiting, blocked and idle; what is missing to 1 is scheduling."""
+        """Executing, waiting, blocked and idle; the rest to 1 is scheduling."""
         return {
             "executing": self.share(self.executing_s),
             "waiting": self.share(sum(self.waiting.values())),
@@ -208,16 +206,22 @@ class TimeBudget:
 
 
 def time_budget_of(node: Mapping[str, Any], running_s: float | None) -> TimeBudget | None:
-    """How a node of ``run.json`` spent its time; ``None`` if it has not reported.
+    """The time budget of a node of ``run.json``; ``None`` if the node has not reported.
 
-    The books of a node begin with it. Initialise hooks are left out; what then is longer than the
-    run was under way is the wait for nodes that began later, and for the end. It is taken off what
-    the node waited for longest: which it was, sums cannot tell.
+    The accounting of a node begins when the node does. Without initialise hooks, its surplus over
+    ``running_s`` is the wait for nodes that began later, and for the end. The surplus is subtracted
+    from the longest causes, since sums do not show which cause it was.
     """
     accounting = node.get("accounting")
     if not accounting:
         return None
-    executing = _without_initialising(accounting.get("executing") or {}, node.get("hooks") or {})
+    hooks = node.get("hooks") or {}
+    executing: dict[str, float] = {}
+    for name, busy_s in (accounting.get("executing") or {}).items():
+        # A function may be an initialise hook and another one.
+        rest_s = (busy_s or 0.0) - (hooks.get(name, {}).get("initialise_s") or 0.0)
+        if rest_s > 0:
+            executing[name] = rest_s
     rests = {
         (state, name): s or 0.0
         for state in ("waiting", "blocked")
@@ -227,21 +231,12 @@ def time_budget_of(node: Mapping[str, Any], running_s: float | None) -> TimeBudg
     if running_s:
         surplus_s = sum(executing.values()) + sum(rests.values()) - running_s
         for cause in sorted(rests, key=lambda cause: rests[cause], reverse=True):
-            taken_s = min(max(surplus_s, 0.0), rests[cause])
-            rests[cause] -= taken_s
-            surplus_s -= taken_s
+            moved_s = min(max(surplus_s, 0.0), rests[cause])
+            rests[cause] -= moved_s
+            surplus_s -= moved_s
 
     def of(state: str) -> dict[str, float]:
         return {name: s for (kind, name), s in rests.items() if kind == state and s > 0}
 
     idle_s, scheduling_s = rests["idle", ""], rests["scheduling", ""]
     return TimeBudget(executing, of("waiting"), of("blocked"), idle_s, scheduling_s)
-
-
-def _without_initialising(
-    executing: Mapping[str, float], hooks: Mapping[str, Mapping[str, Any]]
-) -> dict[str, float]:
-    """Seconds by hook without those of ``neuros_initialise``; a function may have other marks."""
-    initialising = {name: hook.get("initialise_s") or 0.0 for name, hook in hooks.items()}
-    rest = {name: (s or 0.0) - initialising.get(name, 0.0) for name, s in executing.items()}
-    return {name: s for name, s in rest.items() if s > 0}

@@ -9,7 +9,7 @@ from neuros.engine.input_queue import HookInput, Subscription
 from neuros.engine.send_window import SendWindow
 from neuros.engine.sim_clock import ClockSubscription, SimClock, TickInput
 from neuros.errors import HookError
-from neuros.hooks import HookSpec, InputSpec
+from neuros.hooks import HookSpec
 from neuros.project.model import Connection, Node, Port
 from neuros.project.qos import DEPTH
 
@@ -18,25 +18,23 @@ Send: TypeAlias = Callable[[Any], object]
 
 
 class Links(Protocol):
-    """The ways out of a node: one function per output, and one per connection to the node."""
+    """The functions by which a node sends: one per output, and one per connection to the node."""
 
     def sender(self, port: Port, connections: Sequence[Connection]) -> Send | None:
-        """The function that sends packets of an output on its connections to other nodes.
+        """The function that sends packets of an output to other nodes, or on its external topic.
 
-        Of an output with an external topic, the one that publishes there; ``None`` if the packets
-        go nowhere.
+        ``None`` if the output has neither.
         """
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
-        """The function that tells the sender of a connection from another node a position."""
+        """The function that acknowledges packets up to a position to the sender, another node."""
 
 
 class PacketType(NamedTuple):
-    """The type that a hook must return for an output.
+    """The message class of an output, and its check.
 
     Attributes:
-        kind: the message class.
-        check: returns a packet with the values that are sent, or raises ``WrongValue``.
+        check: returns a packet with the values to be sent, or raises ``WrongValue``.
     """
 
     kind: type
@@ -44,11 +42,11 @@ class PacketType(NamedTuple):
 
 
 class Output:
-    """One output of the node and the connections that it feeds.
+    """An output of the node, and the connections that it feeds.
 
     Attributes:
-        packet_type: ``None`` if a hook may return anything for it.
-        send: sends to other nodes, or on an external topic; ``None``: there are none.
+        packet_type: ``None`` if a hook may return any object.
+        send: sends to other nodes, or on an external topic; ``None`` if there is neither.
     """
 
     __slots__ = ("packet_type", "port", "send", "to_itself", "windows")
@@ -74,13 +72,13 @@ class NodePorts:
 
     Args:
         connections: all that begin or end at the node, in the project's order.
-        packet_types: per output name; hooks may return anything where there is none.
+        packet_types: by output name; for other outputs hooks may return any object.
 
     Attributes:
         subscriptions: by connection; those of external topics come last, by the name of the input.
-        send_windows: by connection; one to the node itself is registered from the start.
+        send_windows: by connection; a connection to the node itself is registered from the start.
         outputs: by name.
-        sim_clock: simulated time, as the node's clock tells it.
+        sim_clock: simulated time, from the node's clock.
     """
 
     def __init__(
@@ -129,10 +127,10 @@ class NodePorts:
         }
 
     def inputs_of(self, spec: HookSpec) -> list[HookInput]:
-        """The inputs of a hook, after a check of all ports that it names.
+        """The inputs of a hook, after a check of its ports.
 
         Raises:
-            HookError: if the node has no such port, or a required input has no source.
+            HookError: if the node has no such port, or nothing feeds a required input.
         """
         inputs = [port.name for port in self._node.inputs]
         for kind, ports, known in (
@@ -143,21 +141,22 @@ class NodePorts:
                 if port.name not in known:
                     text = undeclared(kind, port.name, known, self._node)
                     raise HookError(text, hook=spec.name, where=spec.where)
-        return [self._hook_input(spec, port) for port in spec.inputs]
-
-    def _hook_input(self, spec: HookSpec, port: InputSpec) -> HookInput:
-        subscriptions = [s for s in self.subscriptions.values() if s.input_name == port.name]
-        if not subscriptions and not port.is_optional:
-            raise HookError(
-                f"needs input '{port.name}', but nothing is connected to"
-                f" {self._node.name}.{port.name}: connect it, or declare it Optional",
-                hook=spec.name,
-                where=spec.where,
-            )
-        if spec.sim_period_s is not None and self._is_clock(port.name):
-            period_s = spec.sim_period_s
-            return TickInput(port, subscriptions, period_s, self._clock, self.sim_clock)
-        return HookInput(port, subscriptions)
+        found: list[HookInput] = []
+        for port in spec.inputs:
+            feeding = [s for s in self.subscriptions.values() if s.input_name == port.name]
+            if not feeding and not port.is_optional:
+                raise HookError(
+                    f"needs input '{port.name}', but nothing is connected to"
+                    f" {self._node.name}.{port.name}: connect it, or declare it Optional",
+                    hook=spec.name,
+                    where=spec.where,
+                )
+            if spec.sim_period_s is not None and self._is_clock(port.name):
+                period_s = spec.sim_period_s
+                found.append(TickInput(port, feeding, period_s, self._clock, self.sim_clock))
+            else:
+                found.append(HookInput(port, feeding))
+        return found
 
     def _subscription(
         self, key: Connection | str, name: str, input_name: str, capacity: int, **kind: bool

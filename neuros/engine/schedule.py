@@ -1,13 +1,13 @@
 """Which hooks of a node may start, in what order, and what they wait for.
 
 Order: least recently executed first, before any execution in the order of declaration. ``order``
-has all hooks, to tell what the node waits for. An event looks only at ``candidates``, the hooks
-that are enabled, due and have all inputs (each keeps itself in there), and compares their ``turn``:
-so it costs the same beside 2 or 200 resting hooks.
+has all hooks, for questions about what the node waits for. An event reads only ``candidates``, the
+hooks that are enabled, due and have all inputs, and compares their ``turn``: it costs the same
+beside 2 or 200 resting hooks. Each hook adds and removes itself there.
 
 Phases: registering (until every receiver is there), initialising (until each initialise hook has
 run, and every node of the project is ready), running, draining (without the hooks that send
-unasked; those that would go on for ever start once more at most), stopped. Each enables some hooks;
+unasked; hooks of an endless loop start at most once more), stopped. Each phase enables some hooks;
 a pause lets them start in steps only.
 """
 
@@ -29,15 +29,15 @@ _MANY = 2**62
 _LAST_STILL = 16
 
 MOST_EXECUTIONS = 10_000
-"""240 kB, which are freed as soon as they are written."""
+"""240 kB, freed as soon as they are written."""
 
 
 class Schedule:
     """The hooks that may still run.
 
     Attributes:
-        order: all of them, least recently executed first.
-        candidates: those that only a blocked output could keep from running now.
+        order: all hooks, least recently executed first.
+        candidates: the hooks that may run now, unless an output is blocked.
     """
 
     def __init__(self) -> None:
@@ -47,29 +47,29 @@ class Schedule:
         self._first_turn = -_MANY
 
     def add(self, hook: Hook) -> None:
-        """Give a new hook its place: before all that have been executed, behind all others."""
+        """Insert a new hook before all executed hooks, and behind the others."""
         hook.candidates = self.candidates
         hook.turn = self._first_turn
         self._first_turn += 1
         self.order = dict.fromkeys(sorted([*self.order, hook], key=_turn))
 
     def remove(self, hook: Hook) -> None:
-        """Forget a hook that will never run again."""
+        """Remove a hook that will never run again."""
         del self.order[hook]
 
     def move_to_end(self, hook: Hook) -> None:
-        """Note that a hook is executed now."""
+        """Give a hook that starts now the last place."""
         del self.order[hook]
         self.order[hook] = None
         self._turn += 1
         hook.turn = self._turn
 
     def one_pass(self) -> Iterator[Hook]:
-        """The candidates in the order of priority that holds now, each looked for at its turn.
+        """The candidates in the order of their turns at the beginning of the pass.
 
-        A hook that runs in between may add and remove candidates. One comes up if it has not been
-        passed by then: its turn is one that was given before the pass began, up to ``last`` to
-        hooks that have been executed, below ``first_new`` to the others.
+        Hooks that run meanwhile add and remove candidates. A new candidate belongs to the pass if
+        its turn is still to come, and was given before the pass began: up to ``last`` to executed
+        hooks, below ``first_new`` to the others.
         """
         last, first_new, place = self._turn, self._first_turn, -_MANY - 1
         while self.candidates:
@@ -87,10 +87,9 @@ class Schedule:
     # ------------------------------------------------------------------ questions
 
     def rest(self) -> Rest:
-        """The cause of its rest: a receiver, else a missing input, else only its clock. Any thread.
+        """The cause of rest: a blocked output, else a missing input, else a clock. Any thread.
 
-        A hook that could run (and will, at the next event) makes it ``SCHEDULING``. Before its time
-        a tick hook waits for nothing but its clock.
+        ``SCHEDULING`` if a hook can run: it will at the next event.
         """
         waiting: Rest | None = None
         blocked: Rest | None = None
@@ -108,7 +107,7 @@ class Schedule:
         return blocked or waiting or IDLE
 
     def cause_of_rest(self) -> Rest:
-        """As :meth:`rest`, for the engine's own thread: it skips hooks that only wait."""
+        """As :meth:`rest`, for the engine's own thread, and faster: reads candidates first."""
         if not self.candidates:
             for hook in self.order:
                 hook_input = hook.awaited_input()
@@ -131,10 +130,16 @@ class Schedule:
 
     def is_wakeable(self) -> bool:
         """Whether a hook is ready, or a timer or an external topic could make one so."""
-        return any(hook.is_enabled and _could_wake(hook) for hook in self.order)
+        return any(
+            hook.is_enabled
+            and (hook.is_due or not isinstance(hook, Source))
+            and hook.can_send()
+            and all(hook_input.could_be_filled_from_outside() for hook_input in hook.inputs)
+            for hook in self.order
+        )
 
     def free_running_hooks(self) -> list[Hook]:
-        """Hooks that nothing but blocked outputs ever holds up."""
+        """Function hooks without required inputs: only blocked outputs hold them up."""
         return [
             hook
             for hook in self.order
@@ -148,25 +153,16 @@ def _turn(hook: Hook) -> int:
     return hook.turn
 
 
-def _could_wake(hook: Hook) -> bool:
-    """Whether it is ready, or could become so with no packet or acknowledgement of a neighbour."""
-    if isinstance(hook, Source) and not hook.is_due:
-        return False
-    return hook.can_send() and all(
-        hook_input.could_be_filled_from_outside() for hook_input in hook.inputs
-    )
-
-
 class Lifecycle:
     """Enables the hooks of a schedule, phase by phase.
 
     Attributes:
         has_begun: whether the node was started and every receiver has been found.
-        is_ready: whether it has told that it is ready.
+        is_ready: whether the node has reported that it is ready.
         is_active: whether every node of the project is ready.
-        is_running: whether it is active, and every initialise hook has run.
-        last_round: while draining, the hooks that may start once more and no more.
-        tick_start_ns: since when it is running, on the clock; ticks are counted from then.
+        is_running: whether the node is active, and every initialise hook has run.
+        last_round: while draining, the hooks that may start once more.
+        tick_start_ns: the time at which it began to run; ticks count from there.
     """
 
     def __init__(
@@ -189,11 +185,11 @@ class Lifecycle:
 
     @property
     def awaits_others(self) -> bool:
-        """Whether it has initialised, and some other node is not ready."""
+        """Whether the node has initialised, and another one is not ready."""
         return self.has_begun and not self.is_active and not self._initialisers
 
     def start(self, *, awaits_others: bool) -> None:
-        """Initialise as soon as every receiver is there."""
+        """Enable the initialise hooks as soon as every receiver is there."""
         self.is_started = True
         self.is_active = not awaits_others
         self._begin_if_registered()
@@ -212,14 +208,14 @@ class Lifecycle:
             self._begin_if_registered()
 
     def finish_initialiser(self, hook: Hook) -> None:
-        """An initialise hook has run: it never will again."""
+        """Remove an initialise hook that has run."""
         hook.is_enabled = False
         self._schedule.remove(hook)
         self._initialisers.remove(hook)
         self._run_if_initialised()
 
     def drain(self, last_round: Iterable[Hook]) -> None:
-        """Stop the hooks that send unasked; the others go on, ``last_round`` for one start each."""
+        """Disable the hooks that send unasked; hooks of ``last_round`` may start once more."""
         self.is_draining = True
         self.last_round.update(last_round)
         for hook in self._schedule.order:
@@ -227,12 +223,12 @@ class Lifecycle:
                 hook.is_enabled = False
 
     def finish_round(self, hook: Hook) -> None:
-        """A hook of the last round has started: what else arrives for it stays unread."""
+        """Disable a hook of the last round that has started: its further packets stay unread."""
         self.last_round.discard(hook)
         hook.is_enabled = False
 
     def add_source(self, source: Source) -> None:
-        """A thread of the plugin sends for the first time."""
+        """Add the source of a thread of the plugin, which sends for the first time."""
         self._schedule.add(source)
         source.is_enabled = self.is_running and not self.is_draining
 
@@ -261,22 +257,21 @@ class Lifecycle:
 class Pause:
     """A pause of the node: hooks start in single steps only.
 
-    A step of a synchronous simulation is one start of each hook that drives it: one that needs no
-    packet (a main loop, a tick, the thread of a simulator). The other hooks answer what they
-    receive, until nothing is left to answer. In a project that nothing drives (two players and a
-    ball), each hook starts once. The world outside does not pause: what it sends after a step has
-    begun waits for the next one, else there would always be something to answer.
+    In a step, each hook that drives the project (a main loop, a tick, the thread of a simulator)
+    starts once. The other hooks answer their packets until none is left. In a project that nothing
+    drives (two players and a ball), each hook starts once. The world outside does not pause: its
+    packets that arrive after the begin of a step wait for the next one, else a step might not end.
 
-    Ticks have a time of their own, which stands still meanwhile: none is missed by a pause.
+    The time of ticks stands still in a pause, so that none is missed.
 
     Args:
-        arrivals: how many packets have arrived at the node.
+        arrivals: returns the number of packets that have arrived at the node.
 
     Attributes:
         is_on: whether the node is paused.
-        still_ns: when the node stood still, and no hook of a step ran: start and end of each such
-            time, one after the other. No part of them belongs to the latency of a packet.
-        last_still_ns: the last few of them, also when they have been written out.
+        still_ns: start and end of each time without a hook of a step, one after the other. The
+            latency of a packet does not count these times. The packet log empties the array.
+        last_still_ns: the last few of these times.
     """
 
     def __init__(
@@ -296,7 +291,7 @@ class Pause:
         self.is_on = False
 
     def begin(self, now_ns: int) -> None:
-        """Pause; a second time takes back what is left of steps."""
+        """Pause; a second pause revokes the steps that are left."""
         if not self.is_on:
             self.is_on, self._since_ns = True, now_ns
             self._still_since_ns = now_ns
@@ -304,11 +299,11 @@ class Pause:
         self._started.clear()
 
     def end(self, now_ns: int) -> None:
-        """Go on, as if no time had passed for ticks."""
+        """End the pause; for ticks, no time has passed."""
         if not self.is_on:
             return
         self.is_on = False
-        self._move(now_ns)
+        self._end_standstill(now_ns)
         if not self._lifecycle.is_running:
             return
         paused_ns = now_ns - max(self._since_ns, self._lifecycle.tick_start_ns)
@@ -318,14 +313,14 @@ class Pause:
             hook.is_due = hook.due_ns <= now_ns  # a step may have made it due before its time
 
     def grant(self, steps: int, *, is_driven: bool) -> None:
-        """Allow further steps; ``is_driven``: some node of the project has hooks that drive."""
+        """Allow further steps; ``is_driven``: some node of the project has driving hooks."""
         if self.is_on:
             self._granted += steps
             self._arrived = self._arrivals()
             self._limits_all = not is_driven
 
     def wake_ticks(self) -> None:
-        """Ticks that have steps left start now, due or not."""
+        """Make ticks due that have steps left."""
         for hook in self._ticks if self._granted else ():
             if hook.is_enabled and self.allows(hook):
                 hook.is_due = True
@@ -346,16 +341,16 @@ class Pause:
             self._still_since_ns = now_ns
         return PAUSED
 
-    def _move(self, now_ns: int) -> None:
-        """The node stands still no longer."""
+    def _end_standstill(self, now_ns: int) -> None:
+        """End the time in which the node stands still."""
         if self._still_since_ns is not None:
             self.last_still_ns.append((self._still_since_ns, now_ns))
             self.still_ns.extend((self._still_since_ns, now_ns))
             self._still_since_ns = None
 
-    def note_start(self, hook: Hook, now_ns: int) -> None:
-        """A hook starts while the node is paused."""
-        self._move(now_ns)
+    def record_start(self, hook: Hook, now_ns: int) -> None:
+        """Count the start of a hook in the pause."""
+        self._end_standstill(now_ns)
         started = self._started[hook] = self._started.get(hook, 0) + 1
         if drives(hook):
             self._arrived = self._arrivals()
@@ -364,7 +359,7 @@ class Pause:
 
 
 def drives(hook: Hook) -> bool:
-    """Whether a hook starts again and again with no packet for it."""
+    """Whether a hook starts again and again without a packet: a tick, or a main loop."""
     kind = hook.spec.kind
     is_main_loop = all(port.is_optional for port in hook.spec.inputs)
     return kind is HookKind.TICK or (kind is HookKind.FUNCTION and is_main_loop)
@@ -373,14 +368,14 @@ def drives(hook: Hook) -> bool:
 class ExecutionLog:
     """The first executions of a node's hooks, and the acknowledgements that came meanwhile.
 
-    The metrics of a run are sums; single executions show how hooks and packets interlock. The first
-    ones are enough for that, and a list that ends costs nothing afterwards.
+    The metrics of a run are sums; single executions show how hooks and packets interlock. A full
+    log costs nothing.
 
     Attributes:
-        is_full: whether nothing more is noted.
+        is_full: whether recording has ended.
         hooks: name and kind of each hook that has run, in the order of first executions.
         executions: place in ``hooks``, start and end (ns), one after the other.
-        credits: index of a connection, position that was acknowledged and when (ns), likewise.
+        credits: index of a connection, acknowledged position and time (ns), one after the other.
     """
 
     __slots__ = ("_left", "_places", "credits", "executions", "hooks", "is_full")
@@ -393,8 +388,8 @@ class ExecutionLog:
         self.executions = array("q")
         self.credits = array("q")
 
-    def note_execution(self, hook: Hook, start_ns: int, end_ns: int) -> None:
-        """A hook has run."""
+    def record_execution(self, hook: Hook, start_ns: int, end_ns: int) -> None:
+        """Record an execution of a hook."""
         place = self._places.get(hook)
         if place is None:
             place = self._places[hook] = len(self.hooks)
@@ -403,6 +398,6 @@ class ExecutionLog:
         self._left -= 1
         self.is_full = self._left <= 0
 
-    def note_credit(self, connection: Connection, position: int, now_ns: int) -> None:
-        """An acknowledgement has arrived."""
+    def record_credit(self, connection: Connection, position: int, now_ns: int) -> None:
+        """Record an acknowledgement."""
         self.credits.extend((connection.index, position, now_ns))

@@ -1,12 +1,12 @@
-"""The sending end of a connection: it counts the packets that the receiver has not started on.
+"""The sending end of a connection: counts the packets that the receiver has not started on.
 
-"Publish and hope" loses packets, and asking a central controller costs a round trip for each. Here
-the receiver acknowledges a packet when a hook *starts* on it, neither earlier (then a packet could
-be lost behind a busy hook) nor later (then nothing would overlap). The sender counts: ``outstanding
-= sent - acknowledged``. It blocks while that reaches the window ``K + N``, where K is what the
-receiver's input queue holds and N what it may discard in a row. N = 0 is then lossless by
-construction: the queue always has room for what may be sent. Since an acknowledgement carries a
-position and not a mere "one more", it is cumulative; a repeated or late one does no harm.
+"Publish and hope" loses packets, and a central controller costs a round trip per packet. Here the
+receiver acknowledges a packet when a hook *starts* on it: earlier, a packet could be lost behind a
+busy hook; later, nothing would overlap. The sender counts ``outstanding = sent - acknowledged`` and
+blocks while this reaches the window ``K + N``, where K is the size of the receiver's input queue
+and N the packets that it may discard in a row. N = 0 is lossless by construction: the queue has
+room for all packets that may be sent. An acknowledgement carries a position, so a repeated or late
+one does no harm.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from neuros.project.model import Connection
 
 
 class Sender(Protocol):
-    """A hook, as its send windows see it; ``blocked`` counts those that are blocked now."""
+    """A hook, for its send windows; ``blocked`` is the number of the blocked ones."""
 
     blocked: int
 
 
 class SendWindow:
-    """The send window of one connection: it blocks its hooks while it is full.
+    """The send window of a connection: it blocks its hooks while it is full.
 
     Attributes:
-        is_blocked: whether nothing may be sent on it now.
-        is_registered: whether its receiver is known to be there.
-        size: packets that may be outstanding, K + N.
-        sent_ns: when each packet was sent, until the packet log takes the times away.
-        hooks: those that send on it.
+        is_blocked: whether no packet may be sent.
+        is_registered: whether the receiver is there.
+        size: most outstanding packets, K + N.
+        sent_ns: times of sent packets; the packet log empties it.
+        hooks: that send on the connection.
     """
 
     __slots__ = (
@@ -65,11 +65,11 @@ class SendWindow:
 
     @property
     def outstanding(self) -> int:
-        """Packets sent and not acknowledged yet; 0 on a connection without acknowledgements."""
+        """Packets sent and not acknowledged; 0 on a connection without acknowledgements."""
         return self.sent - self.acknowledged if self.is_reliable else 0
 
     def spend(self, now_ns: int) -> None:
-        """Count a packet that is sent now."""
+        """Count a sent packet."""
         self.sent += 1
         self.sent_ns.append(now_ns)
         if self.is_reliable and self.sent - self.acknowledged >= self.size and not self.is_blocked:
@@ -78,7 +78,7 @@ class SendWindow:
                 hook.blocked += 1
 
     def credit(self, position: int, now_ns: int) -> None:
-        """Take an acknowledgement of all packets up to ``position``.
+        """Count an acknowledgement of all packets up to ``position``.
 
         Raises:
             ProtocolError: if more is acknowledged than was sent.
@@ -98,5 +98,5 @@ class SendWindow:
                 hook.blocked -= 1
 
     def frees(self, position: int) -> bool:
-        """Whether an acknowledgement of ``position`` would leave it unblocked."""
+        """Whether an acknowledgement of ``position`` would unblock the window."""
         return self.sent - max(self.acknowledged, position) < self.size

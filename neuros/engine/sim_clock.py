@@ -1,11 +1,11 @@
-"""Simulated time of a node, and its ticks by it: both from the packets of one input, its clock.
+"""Simulated time of a node, and ticks by simulated time, from the packets of the node's clock.
 
-Simulated time is that of the clock packet that a hook of the node took last; where no hook takes
-the clock, of the last one that has arrived. A tick by simulated time is a function hook that
-requires the clock, and starts on a packet of it that reaches the next due time. Earlier packets it
-passes over: they are taken as soon as they are the oldest, and no function is called. While the
-tick runs, simulated time is that of its own packet, though later ones are passed over as it starts.
-So priority, flow control, logging and replay of such a hook are those of any other.
+Simulated time is that of the clock packet that a hook consumed last, or that has arrived last if no
+hook declares the clock. A tick by simulated time is a function hook that requires the clock, and
+starts on a clock packet that reaches the next due time. Earlier packets are skipped: they are
+consumed as soon as they are the oldest, without a call. While the tick runs, simulated time is that
+of its own packet, even if its start has skipped later ones. So priority, flow control, logging and
+replay of such a hook are those of every function hook.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ from neuros.time import to_nanoseconds
 
 
 class SimClock:
-    """Simulated time as far as a node knows it.
+    """The simulated time of a node.
 
     Attributes:
-        now_ns: ``None`` before the first packet, and where the node has no clock.
+        now_ns: ``None`` before the first packet, and of a node without a clock.
     """
 
     __slots__ = ("now_ns",)
@@ -48,17 +48,17 @@ class ClockSubscription(Subscription):
             self.sim_clock.now_ns = to_nanoseconds(packet)
         super().put(arrival, packet)
 
-    def take(self, queue: InputQueue, now_ns: int) -> Any:
-        packet = super().take(queue, now_ns)
+    def consume(self, queue: InputQueue, now_ns: int) -> Any:
+        packet = super().consume(queue, now_ns)
         self.sim_clock.now_ns = to_nanoseconds(packet)
         return packet
 
 
 class Periods:
-    """Counts periods of simulated time: due at 1, 2, ... of them, from time zero on.
+    """Counts periods of simulated time from time zero on; a tick is due at the end of each.
 
-    The first packet, and one that is earlier than the one before it (the simulation was reset), is
-    due only if it is at such a time.
+    The first packet, and the first one after a reset of the simulation (its time is earlier than
+    that of the packet before), is due only if it is at the end of a period.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -74,13 +74,13 @@ class Periods:
         return self._passed(time_ns) > self._done
 
     def tick(self, time_ns: int) -> int:
-        """The tick of this time runs; returns how many before it were missed."""
+        """Count a tick that runs at this time; returns the number of missed ticks before it."""
         missed = self._passed(time_ns) - self._done - 1
         self._done += missed + 1
         return max(0, missed)
 
     def _passed(self, time_ns: int) -> int:
-        # A stamp is a whole number of nanoseconds, rounded: half of one early is on time.
+        # Stamps are rounded to nanoseconds: one that is early by half a nanosecond is on time.
         return (time_ns * 2 + 1) * self._period_ns.denominator // (self._period_ns.numerator * 2)
 
 
@@ -104,31 +104,31 @@ class TickInput(HookInput):
 
     def on_filled(self) -> None:
         super().on_filled()
-        self._pass_over_early_ones(self._clock())
+        self._skip_early(self._clock())
 
     def on_discarded(self) -> None:
-        self._pass_over_early_ones(self._clock())
+        self._skip_early(self._clock())
 
-    def take(self, now_ns: int) -> Any:
-        packet = super().take(now_ns)
+    def consume(self, now_ns: int) -> Any:
+        packet = super().consume(now_ns)
         time_ns = to_nanoseconds(packet)
         self.hook.missed_ticks += self._periods.tick(time_ns)
-        self._pass_over_early_ones(now_ns)
-        self._sim_clock.now_ns = time_ns  # not that of packets which it passes over
+        self._skip_early(now_ns)
+        self._sim_clock.now_ns = time_ns  # not that of skipped packets
         return packet
 
-    def _pass_over_early_ones(self, now_ns: int) -> None:
+    def _skip_early(self, now_ns: int) -> None:
         while (queue := self.chosen()) is not None:
             if self._periods.is_due(to_nanoseconds(queue.packets[0][2])):
                 return
-            queue.subscription.take(queue, now_ns)
+            queue.subscription.consume(queue, now_ns)
 
 
 def with_clocks(node: Node, specs: Sequence[HookSpec]) -> list[HookSpec]:
-    """The hooks of a node, where ticks by simulated time are functions that take its clock.
+    """The hooks of a node; ticks by simulated time become functions with the clock as an input.
 
     Raises:
-        HookError: if there is one, and the node has no clock.
+        HookError: if there is such a tick, and the node has no clock, or an unsuitable one.
     """
     return [spec if spec.sim_period_s is None else _with_clock(node, spec) for spec in specs]
 

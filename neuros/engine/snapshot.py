@@ -1,9 +1,9 @@
-"""Metrics of a running node as plain data, and the explanation of a node that does not move.
+"""Metrics of a running node as plain data, and the reasons why a node does not move.
 
-:func:`snapshot` and :func:`explain` may be called from any thread while the engine runs. They only
-read and take no lock, so figures of one snapshot can be an event apart; once the node has stopped
-they are exact. The sentences of :func:`explain` begin with a verb. Put behind the node's name they
-read "snn waits for `imu` from robot", and so name whole chains.
+Any thread may call :func:`snapshot` and :func:`explain` while the engine runs. They read without a
+lock, so figures of one snapshot can be an event apart; those of a stopped node are exact. The
+sentences of :func:`explain` begin with a verb, for the node's name before them: "snn waits for
+`imu` from robot". So the sentences of several nodes name a chain.
 """
 
 from __future__ import annotations
@@ -30,25 +30,25 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
         now_ns: the time now, on the engine's clock.
 
     Returns:
-        ``state``: what it does now, ``{"state", "cause"}``.
-        ``executing``: the hook that runs now, ``{"name", "for_s", "executions"}``, or ``None``.
+        ``state``: the present state, ``{"state", "cause"}``.
+        ``executing``: the running hook, ``{"name", "for_s", "executions"}``, or ``None``.
         ``outgoing``: counters by connection (``a.out -> b.in``).
         ``incoming``: likewise; an external topic is ``/topic -> b.in``. ``taker`` is a hook that
         is ready to start on the oldest unread packet.
-        ``hooks``: executions, seconds and missed ticks by name; of timed ones their intervals, of
-        those that initialise, how many of the seconds that took.
-        ``accounting``: seconds by cause; ``total`` is the sum of all others.
+        ``hooks``: by name, executions, seconds and missed ticks; intervals of a timed hook; the
+        seconds of initialise hooks.
+        ``accounting``: seconds by cause; ``total`` is their sum.
     """
     hooks = tuple(engine.all_hooks)
     rest = steadily(engine.rest, IDLE)
     return {
         "state": {"state": rest.state.value, "cause": rest.cause},
         "executing": _executing(engine, now_ns),
-        "outgoing": {str(o.connection): _outgoing(o) for o in engine.send_windows.values()},
+        "outgoing": {str(each.connection): _sent(each) for each in engine.send_windows.values()},
         "incoming": {
             f"{subscription.name} -> {engine.node.name}.{subscription.input_name}"
             if subscription.is_external
-            else subscription.name: _incoming(subscription)
+            else subscription.name: _received(subscription)
             for subscription in engine.subscriptions.values()
         },
         "hooks": _hooks(hooks),
@@ -57,7 +57,7 @@ def snapshot(engine: Engine, now_ns: int) -> dict[str, Any]:
 
 
 def steadily(read: Callable[[], _T], otherwise: _T) -> _T:
-    """Read what another thread changes meanwhile: again, if it changed while it was read."""
+    """Read data that another thread changes: again, if a change disturbs the reading."""
     for _ in range(_ATTEMPTS):
         try:
             return read()
@@ -77,8 +77,8 @@ def _executing(engine: Engine, now_ns: int) -> dict[str, Any] | None:
     }
 
 
-def _outgoing(window: SendWindow) -> dict[str, Any]:
-    acknowledged = window.acknowledged  # before `sent`, which only grows: outstanding is never < 0
+def _sent(window: SendWindow) -> dict[str, Any]:
+    acknowledged = window.acknowledged  # before `sent`, which grows: outstanding is never < 0
     sent = window.sent
     return {
         "sent": sent,
@@ -90,10 +90,15 @@ def _outgoing(window: SendWindow) -> dict[str, Any]:
     }
 
 
-def _incoming(subscription: Subscription) -> dict[str, Any]:
-    consumed = subscription.consumed  # before `received`, for that reason, too
+def _received(subscription: Subscription) -> dict[str, Any]:
+    consumed = subscription.consumed  # before `received`, for the same reason
     discarded = subscription.discarded
     received = subscription.received
+
+    def taker() -> str | None:
+        inputs = (q.hook_input for q in subscription.queues if q.hook_input.would_consume(q))
+        return next((each.hook.name for each in inputs if each.hook.is_ready()), None)
+
     return {
         "received": received,
         "consumed": consumed,
@@ -101,14 +106,8 @@ def _incoming(subscription: Subscription) -> dict[str, Any]:
         "longest_discard": subscription.longest_discard,
         "unread": received - consumed - discarded,
         "acknowledged": subscription.acknowledged,
-        "taker": steadily(lambda: _taker(subscription), None),
+        "taker": steadily(taker, None),
     }
-
-
-def _taker(subscription: Subscription) -> str | None:
-    """A hook that could start now, and would take a packet of this subscription."""
-    hooks = (q.hook_input.hook for q in subscription.queues if q.hook_input.would_take(q))
-    return next((hook.name for hook in hooks if hook.is_ready()), None)
 
 
 def _hooks(hooks: tuple[Hook, ...]) -> dict[str, dict[str, Any]]:
@@ -131,7 +130,7 @@ def _accounting(engine: Engine, hooks: tuple[Hook, ...], rest: Rest, now_ns: int
     for hook in hooks:
         cause = Rest(State.EXECUTING, hook.name)
         spent[cause] = spent.get(cause, 0) + hook.busy_ns
-    # What is not counted yet is what the node does now; a hook that has just ended may be ahead.
+    # The open rest belongs to the present state; a hook that has just ended may be ahead of it.
     open_ns = max(0, now_ns - engine.created_ns - sum(spent.values()))
     spent[rest] = spent.get(rest, 0) + open_ns
 
@@ -181,7 +180,6 @@ def _explain(engine: Engine, now_ns: int) -> list[str]:
     reasons = [
         reason for hook in engine.hooks() if hook.is_enabled for reason in _reasons(hook, now_ns)
     ]
-    # Two hooks may have one reason; that is said once.
     if not reasons and not engine.is_active:
         return ["waits until every node of the project is ready"]
     return list(dict.fromkeys(reasons)) or ["has no hook that could run any more"]
@@ -199,27 +197,21 @@ def _reasons(hook: Hook, now_ns: int) -> Iterator[str]:
         if hook_input.missing:
             yield f"waits for `{hook_input.name}` from {_senders(hook_input)}"
     for window in hook.blocking_windows():
-        yield f"is blocked on `{window.connection}` ({_outstanding(window, now_ns)})"
+        last = "none acknowledged yet"
+        if window.acknowledged_ns is not None:
+            last = f"last acknowledged {_seconds(now_ns - window.acknowledged_ns)} ago"
+        yield f"is blocked on `{window.connection}` ({window.outstanding} outstanding, {last})"
     if not hook.is_due:
         wait_ns = hook.due_ns - now_ns
         yield f"waits for the next tick of '{hook.name}' in {_seconds(wait_ns)}"
 
 
 def _senders(hook_input: HookInput) -> str:
-    """The senders of what the input lacks, joined by "or", or by "and" if it needs them all."""
+    """The senders of missing packets, joined by "and" if the input needs them all, else "or"."""
     names = dict.fromkeys(
         queue.subscription.source for queue in hook_input.queues if not queue.packets
     )
     return (" and " if hook_input.is_all else " or ").join(names)
-
-
-def _outstanding(window: SendWindow, now_ns: int) -> str:
-    since_ns = window.acknowledged_ns
-    if since_ns is None:
-        last = "none acknowledged yet"
-    else:
-        last = f"last acknowledged {_seconds(now_ns - since_ns)} ago"
-    return f"{window.outstanding} outstanding, {last}"
 
 
 def _seconds(duration_ns: int) -> str:

@@ -12,7 +12,7 @@ MS = 1_000_000
 def book(*starts_ms: float, period_ms: float = 20.0) -> TickIntervals:
     ticks = TickIntervals(round(period_ms * MS))
     for start_ms in starts_ms:
-        ticks.note(round(start_ms * MS))
+        ticks.record(round(start_ms * MS))
     return ticks
 
 

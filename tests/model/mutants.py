@@ -84,12 +84,12 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "a packet is acknowledged when a hook starts on it, and not before",
         "a longer queue for a slow taker",
-        lambda: patch.object(Subscription, "position_if_taken", _last_received),
+        lambda: patch.object(Subscription, "position_if_consumed", _last_received),
     ),
     Mutant(
         "a packet is acknowledged when every taker has started on it",
         "two takers, of which one waits for more",
-        lambda: patch.object(Subscription, "position_if_taken", _position_of_the_first),
+        lambda: patch.object(Subscription, "position_if_consumed", _position_of_the_first),
     ),
     Mutant(
         "an acknowledgement opens the window again",

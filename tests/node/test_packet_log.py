@@ -85,8 +85,8 @@ def test_first_executions_are_written_with_the_names_of_their_hooks(
     tmp_path: Path, node: Any
 ) -> None:
     hook = Hook(HookSpec(HookKind.FUNCTION, numbers, (), ()), (), {})
-    node.execution_log.note_execution(hook, 100, 250)
-    node.execution_log.note_credit(LEAVING, 1, 300)
+    node.execution_log.record_execution(hook, 100, 250)
+    node.execution_log.record_credit(LEAVING, 1, 300)
     PacketLog(node, {}, tmp_path).write()
     assert numbers(tmp_path, "executions") == [0, 100, 250]
     assert numbers(tmp_path, "credits") == [3, 1, 300]
@@ -140,7 +140,7 @@ def test_no_list_is_kept_where_none_is_wanted(tmp_path: Path, node: Any) -> None
     log = PacketLog(node, {LEAVING: array("Q", [7])}, tmp_path, list_bytes=0)
     node.send_windows[LEAVING].spend(1)
     hook = Hook(HookSpec(HookKind.FUNCTION, numbers, (), ()), (), {})
-    node.execution_log.note_execution(hook, 100, 250)
+    node.execution_log.record_execution(hook, 100, 250)
     log.write()
     assert list(tmp_path.iterdir()) == []
     assert not node.send_windows[LEAVING].sent_ns
