@@ -7,7 +7,7 @@
     │   └── DescriptionError   ... a robot's description is
     ├── UsageError          the command line is wrong          exit code 2
     ├── EnvironmentFault    something is missing on this machine   exit code 4
-    ├── RunError            a run did not end well, and was to
+    ├── RunError            a run failed
     ├── WrongValue          a message holds what its definition does not allow
     ├── ControlError        a control message is not understood
     └── NodeError           a node failed                      exit code 1
@@ -39,10 +39,10 @@ class NeurosError(Exception):
 
 
 def printable(text: str, *, keeps_colours: bool = False) -> str:
-    r"""A text that can be written as UTF-8, and does nothing to a terminal.
+    r"""A text that UTF-8 can encode, and that is harmless for a terminal.
 
-    Half a character, as ``'\udc80'``, is spelt out, and so are escape sequences and other control
-    characters: names in a project may hold them.
+    Lone surrogates, as ``'\udc80'``, and control characters are spelt out: names in a project may
+    hold them.
     """
     text = text.encode("utf-8", "backslashreplace").decode()
     control = _NO_COLOUR if keeps_colours else _CONTROL
@@ -51,10 +51,10 @@ def printable(text: str, *, keeps_colours: bool = False) -> str:
 
 @dataclass(frozen=True, order=True)
 class Problem:
-    """One thing wrong in a project file, or a file of a message package.
+    """A problem in a file of a project or message package.
 
-    ``line`` and ``column`` count from 1, and are 0 where there is no file; ``pointer`` is a JSON
-    pointer (RFC 6901), empty where the file is not JSON.
+    ``line`` and ``column`` count from 1, and are 0 for a problem without a place in the file;
+    ``pointer`` is a JSON pointer (RFC 6901), empty if the file is not JSON.
     """
 
     file: str
@@ -68,13 +68,13 @@ class Problem:
         hint = f" ({self.hint})" if self.hint else ""
         pointer = f"{self.pointer}: " if self.pointer else ""
         place = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
-        if self.file.startswith("--") and self.line == 1:  # an option has but one line
+        if self.file.startswith("--") and self.line == 1:  # an option has one line
             place = f"{self.file}: character {self.column}"
         return f"{place}: {pointer}{self.text}{hint}"
 
 
 class ProjectError(NeurosError):
-    """All problems of a project at once; ``outcome`` is what came of it."""
+    """All problems of a project at once; ``outcome`` is their consequence."""
 
     outcome = "nothing was started"
 
@@ -93,7 +93,7 @@ class DescriptionError(ProjectError):
 
 
 class UsageError(NeurosError):
-    """The command line asks for something that makes no sense."""
+    """The command line, or a call of the API, is wrong."""
 
 
 class EnvironmentFault(NeurosError):
@@ -101,10 +101,7 @@ class EnvironmentFault(NeurosError):
 
 
 class RunError(NeurosError):
-    """A run has ended, but not well, and the program that asks wants only those that have.
-
-    ``exit_code`` is that of the run.
-    """
+    """A run failed with ``exit_code``; raised for programs that require a good run."""
 
     def __init__(self, text: str, exit_code: int) -> None:
         self.exit_code = exit_code
@@ -116,8 +113,8 @@ class WrongValue(NeurosError, ValueError):
 
     Attributes:
         path: of the field, ``poses[3].position.y``; empty if the message itself is of another type.
-        found: the value, and its type.
-        allowed: the type of the field, and what it can hold.
+        found: the value and its type, in words.
+        allowed: the type of the field and its range, in words.
     """
 
     def __init__(self, path: str, found: str, allowed: str) -> None:
@@ -137,7 +134,7 @@ class NodeError(NeurosError):
 class HookError(NodeError):
     """A hook is declared wrongly, failed, or returned what it must not return.
 
-    ``where`` is ``file:line`` in the plugin: of the hook, or, if that failed, of what it did last.
+    ``where`` is ``file:line`` in the plugin: of the hook, or of its line that failed.
     """
 
     def __init__(self, text: str, *, hook: str = "", where: str = "") -> None:
@@ -148,10 +145,7 @@ class HookError(NodeError):
 
 
 class CallbackError(NodeError):
-    """A callback failed that a plugin has registered with ROS.
-
-    ``where`` is ``file:line`` of the callback.
-    """
+    """A ROS callback of a plugin failed; ``where`` is its ``file:line``."""
 
     def __init__(self, text: str, *, callback: str, where: str) -> None:
         self.callback, self.where = callback, where
@@ -167,11 +161,11 @@ class ModelError(NodeError):
 
 
 class ProtocolError(NodeError):
-    """A neighbour broke the rules of a connection (for instance a lossless one lost a packet)."""
+    """A neighbour broke the rules of a connection, as if a lossless one lost a packet."""
 
 
 def results_of(work: Sequence[Future[_Result]]) -> tuple[list[_Result], BaseException | None]:
-    """The results of what has ended well, and, if something has not, one error for all of that."""
+    """The results of futures, and one error for all those that failed, ``None`` if none did."""
     errors = [error for each in work if (error := each.exception())]
     results = [each.result() for each in work if not each.exception()]
     others = [error for error in errors if not isinstance(error, EnvironmentFault)]
@@ -185,4 +179,4 @@ NO_WAITING = (
     " them: let it return, and take an answer with"
     " client.call_async(request).add_done_callback(function)"
 )
-"""What helps where a plugin waits for callbacks of its node."""
+"""The remedy for a plugin that waits for callbacks of its node."""

@@ -40,20 +40,20 @@ class Option:
     Attributes:
         flags: on the command line, as in ``("-n", "--node")``; none: for Python alone. A flag of
             an option that is ``True`` by default switches it off: ``--no-placement``.
-        help: what it does; defaults, choices from the environment, and "repeatable" are added.
-        name: of the Python argument (default: of the last flag, ``domain_id``).
-        default: its value where it is not given; a ``bool`` makes it a switch without a value.
-        parse: makes the value of the text; its ``ValueError`` is a usage error.
-        metavar: what stands for the value in help texts.
-        choices: the values that are allowed, or a function that returns them.
-        suggestions: what a shell completes, a function; other values are allowed.
-        is_repeatable: whether it may be given several times; its value is a tuple.
-        is_negatable: whether ``--x`` has a ``--no-x``; its default may then be ``None``.
-        variable: an environment variable that holds its default.
-        default_help: the default in words, where ``default`` does not say it.
-        group: heading of the options that it is listed with.
-        page: documentation page that says more, as in ``placement.md``.
-        is_recorded: whether ``run.json`` has its value.
+        help: text without default, environment variable and "repeatable", which are added.
+        name: of the Python argument (default: from the last flag, as ``domain_id``).
+        default: the value of a missing option; a ``bool`` makes the option a switch.
+        parse: converts the text; its ``ValueError`` is a usage error.
+        metavar: the word for the value in help texts.
+        choices: the allowed values, or a function that returns them.
+        suggestions: a function that returns values for completion; others are allowed.
+        is_repeatable: whether the option may occur several times; the value is a tuple.
+        is_negatable: whether ``--x`` has a ``--no-x``; the default may then be ``None``.
+        variable: an environment variable with the default.
+        default_help: the default in words, in place of ``default``.
+        group: heading in help texts.
+        page: documentation page, as ``placement.md``.
+        is_recorded: whether ``run.json`` has the value.
     """
 
     flags: tuple[str, ...]
@@ -83,41 +83,41 @@ class Option:
 
     @property
     def full_help(self) -> str:
-        """The help with what else there is to say: whether it is repeatable, its default."""
+        """The help with the default, and whether the option is repeatable."""
         default = f"default: {self.default_text}" if self.default_text else ""
         also = "; ".join(each for each in ("repeatable" * self.is_repeatable, default) if each)
         return f"{self.help} ({also})" if also else self.help
 
     @property
     def all_flags(self) -> tuple[str, ...]:
-        """Its flags, with those that switch it off."""
+        """The flags, with those that switch the option off."""
         negated = [f"--no-{flag[2:]}" for flag in self.flags if flag.startswith("--")]
         return (*self.flags, *(negated if self.is_negatable else ()))
 
     @property
     def has_value(self) -> bool:
-        """Whether a value stands behind its flag."""
+        """Whether a value follows the flag."""
         return not (self.is_negatable or isinstance(self.default, bool))
 
     @property
     def value_text(self) -> str:
-        """What stands for its value in help texts."""
+        """The word for the value in help texts."""
         if self.choices is not None and not self.metavar:
             return "{" + ",".join(self.choices() if callable(self.choices) else self.choices) + "}"
         return self.metavar or self.name.upper()
 
     @property
     def default_text(self) -> str:
-        """Its default in words; empty where it is nothing, or a switch that is off."""
+        """The default in words; empty for none, and for a switch that is off."""
         has_default = not isinstance(self.default, bool) and self.default not in (None, ())
         text = self.default_help or (str(self.default) if has_default else "")
         return ", else ".join(part for part in (self.variable, text) if part)
 
     def value(self, given: Any, environ: Mapping[str, str] | None = None) -> Any:
-        """The value that holds: what is given, else the environment variable, else the default.
+        """The given value, else that of the environment variable, else the default.
 
         Raises:
-            ValueError: if the environment variable is not what :attr:`parse` takes.
+            ValueError: if :attr:`parse` rejects the environment variable.
         """
         if given is not None:
             return given
@@ -134,18 +134,15 @@ def option(*flags: str, help: str, default: Any = None, **declared: Any) -> Any:
     The field is ``None`` by default where an environment variable holds the default.
     """
     declaration = Option(flags, help, name="-", default=default, **declared)
-    is_late = declaration.variable is not None
-    return _field(declaration, None if is_late else declaration.default)
+    own_default = declaration.default if declaration.variable is None else None
+    return field(default=own_default, metadata={_METADATA: declaration})
 
 
 def like(declared_in: type, name: str, **changes: Any) -> Any:
     """A field that is the option ``name`` of another dataclass, with ``changes`` to it."""
     (found,) = (each for each in fields(declared_in) if each.name == name)
-    return _field(replace(found.metadata[_METADATA], **changes), found.default)
-
-
-def _field(declaration: Option, default: Any) -> Any:
-    return field(default=default, metadata={_METADATA: declaration})
+    changed = replace(found.metadata[_METADATA], **changes)
+    return field(default=found.default, metadata={_METADATA: changed})
 
 
 def options_of(declared_in: Any) -> tuple[Option, ...]:
@@ -182,17 +179,15 @@ def takes(
         first, *_ = inspect.signature(function).parameters.values()
         taken = inspect.signature(options).parameters.values()
         call.__dict__["__signature__"] = inspect.Signature([first, *taken])
-        described = [_argument_help(each) for each in options_of(options)]
+        described = []
+        for each in options_of(options):
+            flag = f"``{each.flags[-1]}``: " if each.flags else ""
+            described.append(f"    {each.name}: {flag}{each.full_help}.")
         text = "\n".join([f"{inspect.getdoc(function)}", "", "Args:", *described])
         call.__doc__ = text.replace("%%", "%")  # argparse wants them doubled
         return call
 
     return decorate
-
-
-def _argument_help(option: Option) -> str:
-    flag = f"``{option.flags[-1]}``: " if option.flags else ""
-    return f"    {option.name}: {flag}{option.full_help}."
 
 
 def add_options(
@@ -220,7 +215,7 @@ def _completer(suggestions: Callable[[], Iterable[str]]) -> Callable[..., list[s
 
 
 def _keywords(option: Option) -> dict[str, Any]:
-    """What else ``argparse`` is to know of an option."""
+    """Further keywords of ``add_argument`` for an option."""
     if option.is_negatable:
         return {"action": argparse.BooleanOptionalAction, "default": option.default}
     if not option.has_value:
@@ -231,23 +226,23 @@ def _keywords(option: Option) -> dict[str, Any]:
     if option.is_repeatable:
         # argparse copies the default before it appends to it.
         return {**keywords, "action": "append", "default": [*option.default]}
-    # The environment is asked when the value is used: a program may set it meanwhile.
+    # The environment is read when the value is used: a program may set it before.
     return {**keywords, "default": None if option.variable else option.default}
 
 
 def values_of(options: Iterable[Option], parsed: argparse.Namespace) -> dict[str, Any]:
-    """The values of options that were parsed, by the names of the Python arguments."""
+    """The parsed values of options, by Python argument."""
     found = {each.name: getattr(parsed, each.name) for each in options if each.flags}
     return {name: tuple(v) if isinstance(v, list) else v for name, v in found.items()}
 
 
 def parsed_as(declared_in: Callable[..., _Options], parsed: argparse.Namespace) -> _Options:
-    """A dataclass with the values of its options that were parsed."""
+    """A dataclass with the parsed values of its options."""
     return declared_in(**values_of(options_of(declared_in), parsed))
 
 
 def recorded_values(declared_in: Any) -> dict[str, Any]:
-    """What ``run.json`` has of a dataclass with options; what JSON does not know is text."""
+    """The values of a dataclass with options for ``run.json``; other types become text."""
     recorded = (each.name for each in options_of(declared_in) if each.is_recorded)
     return {name: _as_json(getattr(declared_in, name)) for name in recorded}
 
@@ -261,7 +256,7 @@ def _as_json(value: Any) -> Any:
 
 
 def positive_seconds(text: str) -> float:
-    """A length of time. Raises ``ValueError``, which argparse reports."""
+    """Parse a duration in seconds. Raises ``ValueError``, which argparse reports."""
     seconds = float(text)
     if not 0 < seconds < math.inf:
         raise ValueError(text)
@@ -269,7 +264,7 @@ def positive_seconds(text: str) -> float:
 
 
 def positive_number(text: str) -> int:
-    """A value that counts something. Raises ``ValueError``, which argparse reports."""
+    """Parse a number from 1 on. Raises ``ValueError``, which argparse reports."""
     number = int(text)
     if number < 1:
         raise ValueError(text)

@@ -1,7 +1,7 @@
-"""Files in folders that others may write to, as nodes in containers may to the run folder.
+"""Files in folders to which nodes in containers may write, as the run folder.
 
-There, a link would have us change a file of the user elsewhere: what is written goes to a new file
-that takes the name, or is not written.
+A link there would redirect a write to another file of the user. So these functions write to a new
+file, which then gets the name, and follow no links.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def open_ordinary(path: Path) -> BinaryIO:
 
 
 def descriptor_of(path: Path, flags: int = 0) -> int:
-    """As :func:`open_ordinary`, without a buffer; ``flags``: more of those of ``os.open``."""
+    """As :func:`open_ordinary`, a file descriptor; ``flags``: further flags of ``os.open``."""
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | flags)
     if stat.S_ISREG(os.fstat(descriptor).st_mode):
         return descriptor
@@ -35,7 +35,7 @@ def descriptor_of(path: Path, flags: int = 0) -> int:
 
 
 def open_new(path: Path) -> BinaryIO:
-    """Open a new file in the place of what is there. Raises ``OSError``: also for a folder."""
+    """Open a new file in the place of an old one. Raises ``OSError``: also for a folder."""
     path.unlink(missing_ok=True)
     return open(path, "xb")
 
@@ -46,7 +46,7 @@ def open_log(path: Path) -> BinaryIO:
 
 
 def write_whole(path: Path, data: bytes) -> None:
-    """Write the whole of a file, or leave what was there. Raises ``OSError``: also for a folder."""
+    """Replace a file as a whole, or not at all. Raises ``OSError``: also for a folder."""
     part = path.with_name(f".{path.name}")
     try:
         with open_new(part) as file:
@@ -60,16 +60,15 @@ def write_whole(path: Path, data: bytes) -> None:
 
 @contextlib.contextmanager
 def folder_in(root: Path, *names: str, makes: bool = False) -> Iterator[Path]:
-    """A path to the folder ``names`` below ``root``, for use within the block.
+    """A path to the folder ``names`` below ``root``, which nobody else can replace.
 
-    It leads to the same folder there, also if another takes its name meanwhile. ``root`` itself is
-    one that nobody else can replace.
+    Within the block the path leads to the same folder, even if another one takes its name.
 
     Args:
         makes: make folders that are missing.
 
     Raises:
-        OSError: also if one of the names is that of a link.
+        OSError: also if one of the names is a link.
     """
     descriptor, folder = os.open(root, _FOLDER), root
     try:
@@ -99,13 +98,13 @@ def folder_in(root: Path, *names: str, makes: bool = False) -> Iterator[Path]:
 
 
 def reason_of(error: OSError) -> str:
-    """What went wrong, and with which file if that is known."""
+    """The reason of an error, with the file if it is known."""
     reason = error.strerror or str(error)
     return f"{error.filename}: {reason}" if error.filename else reason
 
 
 def cannot_be_opened(error: OSError) -> str:
-    """One sentence about a file or folder; it names the folder that the user may not enter."""
+    """A sentence about a file or folder; names the folder that the user may not enter."""
     file = os.path.abspath(os.fsdecode(error.filename))
     text = f"{file} cannot be opened ({error.strerror})"
     if error.errno != errno.EACCES:

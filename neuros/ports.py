@@ -1,4 +1,4 @@
-"""All seams of NeuROS on one page: adapters (layer 4) implement what nodes and supervisor use."""
+"""All seams of NeuROS on one page: interfaces for nodes and supervisor, and data in their calls."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Packet: TypeAlias = Any  # one ROS message
 
 
 class Logger(Protocol):
-    """The log of a node: rclpy's logger, or one with these methods."""
+    """The log of a node, as rclpy's."""
 
     def debug(self, message: str) -> object: ...
     def info(self, message: str) -> object: ...
@@ -34,7 +34,7 @@ class Logger(Protocol):
 
 
 class Inbox(Protocol):
-    """A node, as its transport calls it: in the node's own thread, between hooks."""
+    """A node, for its transport, which calls it in the node's thread, between hooks."""
 
     def on_packet(self, connection: Connection, packet: Packet) -> None:
         """A packet has arrived on a connection to this node."""
@@ -43,53 +43,53 @@ class Inbox(Protocol):
         """A packet has arrived on the external topic of an input."""
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
-        """Every taker at the far end has started on the packets up to ``position`` (from 1)."""
+        """All hooks at the far end have started on the packets up to ``position`` (from 1)."""
 
     def on_registered(self, connection: Connection) -> None:
-        """The far end of an output's connection is there: the first packet cannot vanish."""
+        """The far end of an output's connection is there: it will get the first packet."""
 
 
 class Transport(Protocol):
-    """Carries the packets of one node to its neighbours and back."""
+    """Exchanges packets between a node and its neighbours."""
 
     def open(self, inbox: Inbox) -> None:
-        """Create the endpoints and begin to announce this node to its neighbours."""
+        """Create the endpoints, and announce the node to its neighbours."""
 
     def sender(self, connections: Sequence[Connection]) -> Callable[[Packet], bytes | None]:
-        """The function that sends a packet on connections of one output; may return its bytes."""
+        """A function that sends a packet on connections of an output; may return its bytes."""
 
     def send_external(self, port: Port, packet: Packet) -> None:
         """Publish on the external topic of an output."""
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
-        """The function that tells the sender up to which position every taker has started."""
+        """A function that acknowledges packets up to a position to the sender."""
 
     @property
     def digests(self) -> Mapping[Connection, array[int]]:
-        """Digests of all packets sent or received on connections that keep them; read once."""
+        """Digests of all packets of the connections that keep them; for one read."""
 
     @property
     def compressed(self) -> Mapping[str, tuple[int, int]]:
-        """By connection on which this node compresses: bytes before and after."""
+        """Bytes before and after compression, by connection."""
 
     def note_execution(self) -> None:
-        """A hook has ended: what has reached the node meanwhile comes before the next one."""
+        """A hook has ended: handle the arrivals of its time before the next hook."""
 
     def give_way(self) -> None:
-        """That hook took long: what waits for other nodes of this process comes first, too."""
+        """Handle the events of other nodes in this process, too: the hook ran long."""
 
     def has_taken_in(self) -> bool:
-        """Whether that has been handled."""
+        """Whether all arrivals have been handled."""
 
     def waiting_for(self) -> Sequence[Connection]:
-        """Connections whose other end has not been found yet."""
+        """Connections whose other end has not been found."""
 
     def close(self) -> None:
-        """Give up all endpoints; further calls have no effect."""
+        """Destroy all endpoints; further calls have no effect."""
 
 
 class Packets(Protocol):
-    """Operations on packets, for each message class worked out once."""
+    """Operations on packets, compiled once per message class."""
 
     def message_class(self, type_name: str) -> type:
         """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""
@@ -98,23 +98,23 @@ class Packets(Protocol):
         """A new message with default values, for a type in ROS notation."""
 
     def checker(self, kind: type, *, for_jpeg: bool = False) -> Callable[[Packet], Packet]:
-        """A check for packets of a class before they are sent, also as JPEG.
+        """A check of packets of a class, also for JPEG.
 
-        It returns the packet, with the values that its receivers see; raises ``WrongValue``.
+        The check returns the packet with the values that receivers see; raises ``WrongValue``.
         """
 
     def copier(self, type_name: str) -> Callable[[Packet], Packet]:
-        """A function from a checked packet of a type to one that shares nothing with it."""
+        """A function that copies a checked packet of a type; the copy shares nothing with it."""
 
     def encode(self, packet: Packet) -> bytes:
-        """A packet as ROS serialises it."""
+        """A packet in the serialisation of ROS."""
 
     def decode(self, type_name: str, data: bytes) -> Packet:
         """The inverse of :meth:`encode`, for a type in ROS notation."""
 
 
 class Way(str, Enum):
-    """How a packet passes a node that keeps it for the recording."""
+    """The way by which a recorded packet passes a node."""
 
     SENT = "sent"  # by an output, to other nodes or on its external topic
     TO_ITSELF = "to itself"  # on a connection of the node to itself
@@ -123,23 +123,23 @@ class Way(str, Enum):
 
 
 class PacketRecorder(Protocol):
-    """Takes the packets of a node that are recorded."""
+    """Keeps the recorded packets of a node."""
 
     def stream(self, way: Way, name: str) -> int | None:
-        """The number for packets of a port (by ``way``: connection); ``None``: not recorded."""
+        """The number of a stream: a port, or a connection; ``None`` if it is not recorded."""
 
     def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
-        """Keep a serialised packet, with the simulated time of the node if it owns one.
+        """Keep a serialised packet, with the simulated time of a node that has one.
 
-        Raises ``OSError`` if it cannot be kept, and nothing after it either.
+        Raises ``OSError`` if neither this packet nor later ones can be kept.
         """
 
     def close(self) -> None:
-        """Keep nothing any more."""
+        """End the recording."""
 
 
 class EventLoop(Protocol):
-    """The one thread in which all nodes of a process run: one event at a time, oldest first."""
+    """The thread of all nodes of a process: one event at a time, oldest first."""
 
     @property
     def has_waiting_events(self) -> bool:
@@ -147,19 +147,19 @@ class EventLoop(Protocol):
 
     @property
     def has_taken_in(self) -> bool:
-        """Whether all that had come from outside has been handled; at a loop-back it has."""
+        """Whether all arrivals have been handled; at a loop-back they have."""
 
     def note_execution(self) -> None:
-        """A hook, or a callback of a plugin, has ended: something may have arrived meanwhile."""
+        """A hook, or a callback of a plugin, has ended; packets may have arrived meanwhile."""
 
     def post(self, event: Callable[[], None]) -> None:
-        """Handle ``event`` after everything that already waits. Loop thread only."""
+        """Handle ``event`` after all waiting events. Loop thread only."""
 
     def post_loop_back(self, event: Callable[[], None]) -> None:
-        """The same, and after everything that waits outside (in ROS), too."""
+        """As :meth:`post`, also after all events that wait in ROS."""
 
     def post_from_thread(self, event: Callable[[], None]) -> None:
-        """Like :meth:`post`, from any thread; wakes the loop."""
+        """As :meth:`post`, from any thread; wakes the loop."""
 
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Callable[[], None]) -> None:
         """Call ``on_due`` whenever the monotonic clock reaches ``next_due_ns()``."""
@@ -175,14 +175,14 @@ class Voice(Protocol):
     """Publishes the state of a launcher to its peers."""
 
     def say(self, text: str) -> None:
-        """Let it be heard elsewhere, also by who comes later. Any thread."""
+        """Publish the state, also for later subscribers. Any thread."""
 
     def close(self) -> None:
-        """Let the last state arrive, then be silent."""
+        """Let the last state arrive, then end."""
 
 
 class Middleware(Protocol):
-    """Joins the nodes of this process to each other and to the rest of the world."""
+    """Connects the nodes of a process to each other and to the rest of the world."""
 
     @property
     def loop(self) -> EventLoop: ...
@@ -199,14 +199,14 @@ class Middleware(Protocol):
     def mark_own_entities(
         self, file: NodeFile, enter: Callable[[], None], fail: Callable[[Any, BaseException], None]
     ) -> None:
-        """Remember what exists on a ROS node before its plugin gets hold of it.
+        """Tell NeuROS's entities of a ROS node from those that its plugin creates later.
 
-        ``enter`` is called before each callback of subscriptions, timers, services, clients and
-        actions that the plugin creates there, ``fail`` with the callback and what it has raised.
+        ``enter`` is called before each callback of the plugin's subscriptions, timers, services,
+        clients and actions, ``fail`` with a callback and its exception.
         """
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
-        """Whether a plugin has subscriptions, timers, services or clients on its ROS node."""
+        """Whether a plugin has created entities on its ROS node."""
 
     def join_peers(
         self,
@@ -214,19 +214,19 @@ class Middleware(Protocol):
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
     ) -> Voice:
-        """Speak for the nodes ``names`` of this process, and listen to nodes elsewhere.
+        """Publish the state of the nodes ``names``, and subscribe to that of nodes elsewhere.
 
-        ``heard`` is called from any thread, with a node and its state, or ``None`` when it is gone.
+        ``heard`` is called from any thread with a node and its state; ``None``: the node has ended.
         """
 
     def take_in(self) -> None:
-        """Handle what had arrived when the loop was stopped, so that it counts; call no plugin."""
+        """Count what had arrived when the loop was stopped; no hook runs."""
 
     def flush(self) -> None:
-        """Send and receive nothing any more, and let what was sent last leave."""
+        """End sending and receiving; packets sent before still leave."""
 
     def close(self) -> None:
-        """Give up everything, once flushed."""
+        """Destroy all entities, after :meth:`flush`."""
 
 
 class TransportKind(ABC):
@@ -246,17 +246,20 @@ class TransportKind(ABC):
     ) -> Middleware:
         """The middleware of a process with these nodes.
 
-        ``on_failure`` takes what fails outside of hooks; ``digests``: keep one of every packet,
-        whatever that costs; ``record``: packets are recorded; ``debug``: log DEBUG records.
+        Args:
+            on_failure: is called with errors outside of hooks.
+            digests: whether to keep a digest of every packet.
+            record: whether packets are recorded.
+            debug: whether to log DEBUG records.
         """
 
 
 WorldLook: TypeAlias = "Callable[[Mapping[str, Any], int], Mapping[str, Any]]"
-"""Shows a simulated world to an observer, for JSON, from any thread: what it wants, its number."""
+"""A view of a simulated world, for JSON, by the observer's request and number. Any thread."""
 
 
 class NodeContext(Protocol):
-    """The ``node`` that hooks receive, as far as simulators need it."""
+    """The node handle of hooks, as far as simulators need it."""
 
     @property
     def name(self) -> str:
@@ -264,48 +267,48 @@ class NodeContext(Protocol):
 
     @property
     def run_dir(self) -> Path:
-        """Its own writable folder in the run folder."""
+        """The node's writable folder in the run folder."""
 
     @property
     def description(self) -> Node:
-        """The node as its file declares it (ports, ``mujoco`` keys, environment)."""
+        """The declaration of the node: ports, ``mujoco`` keys, environment."""
 
     def make_packet(self, output: str) -> Packet:
         """A new message of the type of an output."""
 
     def get_logger(self) -> Logger:
-        """A logger that writes to the node's log."""
+        """The log of the node."""
 
     def resolve_path(self, path: str) -> Path:
-        """An existing file, looked up as paths in node files are. Raises ``ModelError``."""
+        """An existing file, found like paths in node files. Raises ``ModelError``."""
 
     def own_simulated_time(self, read_s: Callable[[], float]) -> None:
         """Report simulated time, in seconds, by calling ``read_s`` (cheap, from any thread)."""
 
     def note_simulated_time(self) -> bool:
-        """Tell, from any thread, that it has gone on; returns whether it is to go on further."""
+        """Report progress of simulated time; returns whether to go on. Any thread."""
 
     def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
-        """Wait, in a thread, for time 0 of the run; False if ``cancelled()`` or the node ends."""
+        """Wait for time 0 of the run; False if ``cancelled()`` or the node ends. Other threads."""
 
     def show_world(self, look: WorldLook) -> None:
-        """Let observers look at a simulated world; see :mod:`neuros.simulators.mujoco.scene`."""
+        """Show a simulated world to observers; see :mod:`neuros.simulators.mujoco.scene`."""
 
     def submit(self, packets: Mapping[str, Packet], cancelled: Callable[[], bool]) -> bool:
-        """Send from another thread, as if a hook had returned them; wait while one is blocked.
+        """Send packets, by output, from another thread; waits while an output is blocked.
 
-        Returns ``False``, without having sent, once ``cancelled()`` is true or the node ends.
+        Returns ``False`` if ``cancelled()`` or the end of the node came first.
         """
 
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
 
     def fail(self, error: BaseException) -> None:
-        """End the node as failed by ``error``, which no hook raised. Any thread."""
+        """End the node with an error from outside of hooks. Any thread."""
 
 
 class Simulator(Protocol):
-    """A world with a time of its own."""
+    """A simulated world."""
 
     @property
     def sim_time(self) -> float:
@@ -316,121 +319,121 @@ class Simulator(Protocol):
         """Simulated seconds per step."""
 
     def step_synchronous(self, count: int = 1) -> None:
-        """Advance ``count`` timesteps; nothing is sent. Raises ``ModelError``."""
+        """Advance ``count`` timesteps, without sending. Raises ``ModelError``."""
 
     def step_to_next(self) -> None:
         """Advance to the next firing of any sensor."""
 
     def read(self, output: str) -> Packet | None:
-        """The packet of a sensor that has come due since the last read, if there is one."""
+        """The packet of a sensor that came due since the last read, if any."""
 
     def run_asynchronous(self, real_time_factor: float | None = 1.0) -> None:
-        """Step in a thread of its own, so many simulated seconds per wall second (None: freely)."""
+        """Step in a thread, at this many simulated seconds per wall second (``None``: freely)."""
 
     def pause(self) -> None:
-        """Let no further step begin."""
+        """Begin no further step."""
 
     def resume(self) -> None:
-        """Go on after :meth:`pause`; the time between is not caught up."""
+        """Go on after :meth:`pause`, at the time of the pause."""
 
     def reset(self) -> None:
-        """Back to time zero and the initial state; unread packets are dropped."""
+        """Return to time zero and the initial state; drop unread packets."""
 
 
 class ControlStream(Protocol):
-    """Bytes to and from another process, in order: a connected ``socket.socket`` is one."""
+    """A byte stream to another process, as a connected ``socket.socket``."""
 
     def fileno(self) -> int:
-        """For selectors: readable when :meth:`recv` does not wait."""
+        """For selectors; readable when :meth:`recv` does not wait."""
 
     def setblocking(self, flag: bool, /) -> None:
-        """Whether calls wait; else they raise ``BlockingIOError``."""
+        """Let calls wait, or raise ``BlockingIOError``."""
 
     def recv(self, size: int, /) -> bytes:
-        """What has arrived; empty once the other end is gone. Raises ``OSError``."""
+        """Arrived bytes; empty once the other end is gone. Raises ``OSError``."""
 
     def send(self, data: bytes | bytearray, /) -> int:
-        """Send as much as can be; returns the number of bytes. Raises ``OSError``."""
+        """Send a part; returns the number of bytes. Raises ``OSError``."""
 
     def sendall(self, data: bytes, /) -> None:
         """Send all. Raises ``OSError``."""
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the stream."""
 
 
 class ControlListener(Protocol):
-    """The supervisor's end of the control channel, before others connect; from a back end."""
+    """The listening end of the control channel, from a back end."""
 
     @property
     def address(self) -> str:
-        """By which processes on this machine connect: ``unix:/runs/1/control.sock``."""
+        """The address for processes on this machine: ``unix:/runs/1/control.sock``."""
 
     @property
     def files(self) -> Sequence[Path]:
-        """What remains where the launcher is killed."""
+        """Files that a killed launcher leaves behind."""
 
     def open(self) -> None:
         """Listen. Raises ``EnvironmentFault``."""
 
     def fileno(self) -> int:
-        """For selectors: readable when somebody connects."""
+        """For selectors; readable when a connection waits."""
 
     def accept(self) -> ControlStream | None:
-        """The next connection; ``None`` if nobody waits."""
+        """The next connection; ``None`` if none waits."""
 
     def close(self) -> None:
-        """Listen no more."""
+        """Stop listening."""
 
 
 class RunningNode(Protocol):
-    """A started process or container, and the nodes that live in it."""
+    """A started process or container, with its nodes."""
 
     @property
     def names(self) -> tuple[str, ...]: ...
 
     def poll(self) -> str | None:
-        """``None`` while it runs, then how it ended: "exit code 0", "killed by SIGKILL"."""
+        """``None`` while running, then the end: "exit code 0", "killed by SIGKILL"."""
 
     @property
     def is_abandoned(self) -> bool:
-        """Whether what it ran in has gone (its engine), so that its node is not to blame."""
+        """Whether the container engine is gone, so that the node is not to blame."""
 
     def kill(self) -> None: ...
 
     def threads(self) -> ProcessThreads:
-        """Where its threads stand in Python; empty if that cannot be read."""
+        """The Python stacks of its threads; empty if they cannot be read."""
 
 
 class Launcher(Protocol):
-    """Starts nodes, and knows nothing of what they do."""
+    """Starts nodes."""
 
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
     ) -> Sequence[RunningNode]:
-        """Start all or none, with this added to their environment. Raises ``EnvironmentFault``."""
+        """Start all nodes or none; adds ``environment``. Raises ``EnvironmentFault``."""
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
-        """One line per thing that :meth:`start` would start."""
+        """One line for each process or container that :meth:`start` would start."""
 
 
 class ChildProcess(Protocol):
-    """A process that leads a session and a process group of its own."""
+    """A child process that leads its own session and process group."""
 
     pid: int
 
     def poll(self) -> int | None:
-        """``None`` while it runs, then its exit code, negative for a signal."""
+        """``None`` while running, then the exit code, negative for a signal."""
 
     def wait(self, timeout_s: float) -> None:
-        """Until it has ended, or ``timeout_s`` seconds have passed."""
+        """Wait for the end, for ``timeout_s`` seconds at most."""
 
     def send_signal(self, number: int, *, is_for_group: bool = False) -> None:
-        """Send a signal to it, or to its process group; does nothing where it has ended."""
+        """Signal the process, or its process group; does nothing after the end."""
 
 
 class Reaper(Protocol):
-    """Ends what is left of a run when its launcher has ended, be it by SIGKILL."""
+    """Cleans up a run after the end of its launcher, even by SIGKILL."""
 
     def spawn(
         self,
@@ -440,37 +443,38 @@ class Reaper(Protocol):
         environment: Mapping[str, str],
         cores: Sequence[int] = (),
     ) -> ChildProcess:
-        """Start a process in a session of its own, without input; its output goes to the log.
+        """Start a process in its own session, without input; its output goes to the log.
 
-        All that descends from it ends with the run. Raises ``OSError``.
+        Its descendants end with the run. Raises ``OSError``.
         """
 
     def watch(self, pid: int) -> None:
-        """Announce another process, which leads a session of its own."""
+        """Register another process, which leads its own session."""
 
     def remove_later(self, path: Path) -> None:
-        """Have a file, socket or folder removed once all processes of the run are gone."""
+        """Remove a file, socket or folder once all processes of the run are gone."""
 
     def clean_with(self, module: str, argument: str) -> None:
-        """Have a module clean up what is no process of this machine: containers, jobs.
+        """Register a module that cleans up containers or jobs, with the standard library only.
 
-        It needs the standard library only. Its ``resume(argument, run_id)`` lets paused nodes go
-        on, to end. Its ``remove(argument, run_id, settle_s=..., give_up_s=...)`` removes what is
-        left, until nothing was for ``settle_s`` (more may be under way), or after ``give_up_s``.
+        Its ``resume(argument, run_id)`` resumes paused nodes, for their end. Its
+        ``remove(argument, run_id, settle_s=..., give_up_s=...)`` removes containers or jobs until
+        none was left for ``settle_s`` (more may appear), for ``give_up_s`` at most.
         """
 
 
 @dataclass(frozen=True)
 class NodeProgram:
-    """The program that runs nodes, and what a run gives it.
+    """The program that runs nodes.
 
     Attributes:
         options: of the program, as ``--debug``.
-        cores, pythons: by name, of nodes that ask for some, or do not run on this Python.
-        reaper: starts processes, and is told of all else that is; ``None`` where nothing is.
+        cores: by node, the cores that it may use; other nodes may use any.
+        pythons: by node, the Python that it needs in place of this one.
+        reaper: of the run; ``None`` if it starts nothing.
         environ: the environment of the launcher.
-        is_isolated: whether the nodes are to have a network of their own.
-        program: the command without its options; paths of ``node.json`` files follow these.
+        is_isolated: whether the nodes have a network of their own.
+        program: the command without options and paths of ``node.json`` files.
     """
 
     options: Sequence[str] = ()
@@ -482,7 +486,7 @@ class NodeProgram:
     program: Sequence[str] = field(default_factory=lambda: python_command("neuros.cli", "node"))
 
     def command(self, python: Sequence[str] = ()) -> tuple[str, ...]:
-        """The command on this Python, or on the one that ``python`` starts."""
+        """The command with this Python, or with the command ``python``."""
         return (*(python or self.program[:1]), *self.program[1:], *self.options)
 
 
@@ -490,54 +494,54 @@ Notice: TypeAlias = tuple[str, str]  # a line for the user: severity (INFO, WARN
 
 
 class Deployment(ABC):
-    """A back end made ready for some nodes; defaults are for nodes that see files as we do."""
+    """A back end ready for some nodes; the defaults are for nodes with this machine's paths."""
 
     notices: Sequence[Notice] = ()
     places: Mapping[str, str] = {}
-    """The machine of each node that is not on this one."""
+    """The machine of each node that runs on another one."""
 
     def connect(self, log: Callable[[str, str], None]) -> Sequence[str]:
-        """Reach the other machines and get them ready; returns their addresses.
+        """Connect to the other machines and prepare them; returns their addresses.
 
         Args:
-            log: takes lines for the user, as ``(severity, text)``, in any thread.
+            log: receives ``(severity, text)`` for the user, in any thread.
 
         Raises:
-            EnvironmentFault: with all that went wrong; none of them is held any more then.
+            EnvironmentFault: with all faults; every machine is released then.
         """
         return ()
 
     @abstractmethod
     def launcher(self, program: NodeProgram) -> Launcher:
-        """What starts the nodes."""
+        """The launcher of the nodes."""
 
     def as_seen(self, file: NodeFile) -> NodeFile:
-        """A node with all paths as it sees them itself."""
+        """A node with its paths in the place where it runs."""
         return file
 
     def as_here(self, text: str, folders: Folders) -> str:
-        """What a node has said, with the names that its paths have on this machine."""
+        """The output of a node, with its paths translated to this machine."""
         return text
 
     def control_listener(self, run_folder: Path) -> ControlListener | None:
-        """Where node processes connect to the supervisor; ``None``: a socket in the run folder."""
+        """The listener of the control channel; ``None``: a socket in the run folder."""
         return None
 
     def logs(self, run_folder: Path) -> Mapping[str, Path]:
-        """Logs besides those of the nodes, by what is shown of their origin."""
+        """Logs besides those of nodes, by their displayed origin."""
         return {}
 
     def finish(self, is_enough: Callable[[], bool]) -> Sequence[str]:
-        """Bring here what nodes have left elsewhere, until ``is_enough()``; returns faults."""
+        """Fetch files of nodes on other machines, until ``is_enough()``; returns faults."""
         return ()
 
     def record(self) -> Mapping[str, Any]:
-        """What ``run.json`` is to have of it, ready for JSON; asked for when the run is over."""
+        """Facts about the deployment for ``run.json``, at the end of the run."""
         return {}
 
 
 class State(Enum):
-    """How good a finding is."""
+    """The state of a finding."""
 
     GOOD = "ok"
     ABSENT = "-"  # projects run without it
@@ -546,7 +550,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of ``neuros doctor``: what was looked at, what was found, what to do."""
+    """A line of ``neuros doctor``."""
 
     state: State
     subject: str
@@ -575,12 +579,12 @@ class Subcommand:
     """A command of ``neuros``. Registered as an entry point of the group ``neuros.commands``.
 
     Attributes:
-        module: is imported when the command is used. Its ``add_<command>(parser)`` adds the
-            arguments and sets the default ``command``, which is called with the parsed arguments
-            and returns the exit code. With ``prepare_<command>(parser, arguments)`` it adds options
-            that depend on others.
-        help: its line in ``neuros --help``; empty for a program that NeuROS starts itself.
-        is_for_people: whether its output goes to a terminal, and not to a log or a program.
+        module: is imported when the command is used. Its ``add_<command>(parser)`` adds arguments
+            and sets the default ``command``, a function of the parsed arguments that returns the
+            exit code. Its optional ``prepare_<command>(parser, arguments)`` adds options that
+            depend on other arguments.
+        help: the line in ``neuros --help``; empty for a command that only NeuROS uses.
+        is_for_people: whether the output is for a terminal, and not for a log or a program.
     """
 
     module: str
@@ -590,12 +594,12 @@ class Subcommand:
 
 @dataclass(frozen=True)
 class Shown:
-    """The run that is shown.
+    """A run, for its views.
 
     Attributes:
-        environment: what the environment of its nodes has beside that of the launcher.
+        environment: variables of the nodes that the launcher does not have.
         logs: by node.
-        names: the nodes of this run; the others of the project run elsewhere.
+        names: the nodes of this run; other nodes of the project run elsewhere.
     """
 
     run_id: str
@@ -608,16 +612,16 @@ class Shown:
 
 
 class View(Protocol):
-    """Shows one run while it goes on."""
+    """A view of a running run."""
 
     def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None:
-        """Open it, once there is a control socket; ``log`` tells the user, with a severity.
+        """Open the view, once there is a control socket; ``log`` takes ``(severity, text)``.
 
         Raises ``EnvironmentFault``.
         """
 
     def finish(self) -> None:
-        """Close it with the run, also where it was not started."""
+        """Close the view at the end of the run, even if it was not started."""
 
 
 class LaunchExtension(ABC):
@@ -629,7 +633,7 @@ class LaunchExtension(ABC):
     def prepare(
         self, options: Mapping[str, Any], back_end: BackEnd, *, is_isolated: bool
     ) -> View | None:
-        """Find what is needed to show the run as the options want it; ``None``: they want nothing.
+        """The view that the options request; ``None`` if they request none.
 
         Args:
             options: the value of each of :attr:`options`, by name.
@@ -637,8 +641,8 @@ class LaunchExtension(ABC):
             is_isolated: whether the run has a network of its own.
 
         Raises:
-            UsageError: for values that make no sense.
-            EnvironmentFault: if something is missing here.
+            UsageError: for options that contradict each other.
+            EnvironmentFault: if something is missing on this machine.
         """
 
 
@@ -656,13 +660,13 @@ class ModelFormat(ABC):
         """The file of a model that is not in the project.
 
         Args:
-            name: as the user gave it; may be relative, or a URI.
+            name: a path, or a URI.
             folder: of the plugin.
         """
 
     @abstractmethod
     def read(self, file: Path, environ: Mapping[str, str]) -> tuple[Any, Sequence[str]]:
-        """An ``MjSpec``, and a line for each part of the file that it lacks, or has otherwise.
+        """An ``MjSpec``, and a line for each part of the file that it lacks or changes.
 
         Raises:
             DescriptionError: with all problems of the file.
@@ -675,7 +679,7 @@ Job: TypeAlias = "Callable[[], Any]"
 
 @dataclass(frozen=True)
 class JobResources:
-    """What a job asks a cluster for; ``None`` and 0: nothing, so the cluster's default holds."""
+    """Resources of a job on a cluster; ``None`` and 0: the cluster's default."""
 
     cpus: int | None = None
     mem_bytes: int | None = None
@@ -683,10 +687,9 @@ class JobResources:
 
     @classmethod
     def of(cls, project: Project) -> JobResources:
-        """The ``resources`` of all nodes summed.
+        """The sum of the declared ``resources`` of all nodes.
 
-        What a node does not declare counts nothing. A GPU that several nodes name counts once;
-        ``all`` stands for those that the job gets, and asks for one.
+        A GPU that several nodes name counts once; ``all`` counts as one GPU.
         """
         cpus = [node.resources.cpus for node in project.nodes if node.resources.cpus]
         memory = [node.resources.mem_bytes for node in project.nodes if node.resources.mem_bytes]
@@ -699,7 +702,7 @@ class JobResources:
 
     @classmethod
     def most(cls, needs: Iterable[JobResources]) -> JobResources:
-        """What is enough for each of several jobs."""
+        """The least resources that are enough for each of several jobs."""
         listed = list(needs)
         return cls(
             max((each.cpus for each in listed if each.cpus), default=None),
@@ -710,14 +713,14 @@ class JobResources:
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """A sweep whose runs are to be executed.
+    """A sweep, for its executor.
 
     Attributes:
         name: of the project.
-        folder: of the sweep, which every machine that executes runs sees under this path.
-        count: how many runs at once, ``None``: as many as there is room for.
+        folder: of the sweep; the same path on every machine that executes runs.
+        count: of runs at a time, ``None``: as many as there is room for.
         resources: of each run.
-        distribution: has the code of the jobs; machines that execute them have it, too.
+        distribution: with the code of the jobs, installed on every machine.
     """
 
     name: str
@@ -728,24 +731,24 @@ class SweepPlan:
 
 
 class Jobs(Protocol):
-    """The jobs of one sweep."""
+    """The jobs of a sweep."""
 
     def submit(self, jobs: Sequence[Job]) -> Sequence[Future[Any]]:
-        """Hand over jobs, in this order; the futures have what they return.
+        """Submit jobs, in this order; the futures hold their results.
 
         Raises ``EnvironmentFault``.
         """
 
     def cancel(self) -> None:
-        """End the jobs. Those that begin later return at once by themselves."""
+        """End the running jobs; jobs that begin later return at once."""
 
 
 class SweepExecutor(ABC):
-    """What executes runs of sweeps. An entry point of the group ``neuros.executors``.
+    """Executes runs of sweeps. An entry point of the group ``neuros.executors``.
 
     Attributes:
-        name: in ``--executor``; that of the entry point.
-        place: what ``--executor NAME=...`` names, as ``ADDRESS``; empty: nothing.
+        name: of the entry point, for ``--executor``.
+        place: the word for the value of ``--executor NAME=...``, as ``ADDRESS``; empty: no value.
     """
 
     name: str
@@ -753,44 +756,45 @@ class SweepExecutor(ABC):
 
     @abstractmethod
     def open(self, place: str | None, plan: SweepPlan) -> AbstractContextManager[Jobs | Executor]:
-        """Connect to what executes; the end of the context waits for the jobs that go on.
+        """Connect to the executor; the end of the context waits for running jobs.
 
-        A pool of :mod:`concurrent.futures` will do.
+        The context may be a pool of :mod:`concurrent.futures`.
 
         Raises:
-            UsageError: for a place or a count that makes no sense.
+            UsageError: for a wrong place or count.
             EnvironmentFault: if something is missing, or does not answer.
         """
 
 
 class PluginCheck(ABC):
-    """Checks nodes before a run. An entry point of the group ``neuros.plugin_checks``.
+    """Checks the nodes of a plugin before a run. An entry point of ``neuros.plugin_checks``.
 
-    Its name is that of a module, the plugin of these nodes.
+    The name of the entry point is that of the plugin's module.
     """
 
     @abstractmethod
     def problems(self, node: Node) -> Iterable[Problem]:
-        """What keeps the node from running."""
+        """The mistakes that keep the node from running."""
 
     @abstractmethod
     def doubts(self, node: Node) -> Iterable[Problem]:
-        """What may not be meant so, or cannot be checked here."""
+        """Possible mistakes, and parts that cannot be checked on this machine."""
 
 
 class BackEnd(ABC):
     """Where nodes run. Registered as an entry point of the group ``neuros.backends``.
 
     Attributes:
-        name: in ``--backend``; that of the entry point.
-        place: where it runs a node, as in "each node in *a container*".
-        rank: ``--backend auto`` takes the usable one with the highest; ``None``: never this one.
+        name: of the entry point, for ``--backend``.
+        place: of a node, as in "each node in *a container*".
+        rank: ``--backend auto`` chooses the usable back end of highest rank; ``None``: never.
         options: of ``neuros launch`` with this back end.
-        transport: the name of the transport that its nodes use.
-        is_one_process: whether all nodes share a process. They take turns then, and hand packets
-            over in memory, where ROS tools and other launchers do not see them.
-        has_own_pythons: whether nodes run on Pythons that it brings (those of images).
-        has_own_network: whether it gives an isolated run its network; else the launcher enters one.
+        transport: the name of the transport of its nodes.
+        is_one_process: whether all nodes share a process. They run in turns then, and exchange
+            packets in memory, invisible for ROS tools and other launchers.
+        has_own_pythons: whether nodes run on Pythons of the back end (those of images).
+        has_own_network: whether the back end makes the network of an isolated run, in place of the
+            launcher.
     """
 
     name: str
@@ -805,42 +809,42 @@ class BackEnd(ABC):
     def prepare(
         self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
     ) -> Deployment:
-        """Find what the nodes need to run here.
+        """Prepare a run of the nodes.
 
         Args:
             options: the value of each of :attr:`options`, by name.
 
         Raises:
-            EnvironmentFault: with all that is missing, and what to do.
+            EnvironmentFault: with everything that is missing, and remedies.
         """
 
     def why_not(self, fault: EnvironmentFault) -> str:
-        """Why ``auto`` does not take it, in one line, for what :meth:`prepare` has raised."""
+        """The reason why ``auto`` skips the back end, in one line; ``fault`` of :meth:`prepare`."""
         reason, *others = str(fault).splitlines()
         return f"{reason} (and {len(others)} more)" if others else reason
 
     def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
-        """What ``neuros doctor`` finds of what it needs."""
+        """Findings of ``neuros doctor`` about the needs of the back end."""
         return ()
 
     def on_this_machine(self, file: NodeFile, folders: Folders, messages: Path) -> NodeFile:
-        """The inverse of :meth:`Deployment.as_seen`, for a run that is over.
+        """The inverse of :meth:`Deployment.as_seen`, after a run.
 
-        ``messages`` is the folder with built message packages of this machine.
+        ``messages``: the folder of built message packages on this machine.
         """
         return file
 
     def place_in(self, record: Mapping[str, Any], node: str) -> str:
-        """Where a node of a run that is over has run, as :attr:`place`, by its ``run.json``."""
+        """The :attr:`place` of a node of a past run, by its ``run.json``."""
         return self.place
 
     def provenance(self, record: Mapping[str, Any]) -> Mapping[str, str]:
-        """What reports show of :meth:`Deployment.record`, by heading."""
+        """Facts of :meth:`Deployment.record` for reports, by heading."""
         return {}
 
 
 class DeploymentKind(ABC):
-    """How nodes run where a deployment file says, an entry point of ``neuros.deployments``."""
+    """Runs nodes by a deployment file, an entry point of ``neuros.deployments``."""
 
     name: str
 
@@ -853,15 +857,19 @@ class DeploymentKind(ABC):
         *,
         monitors_load: bool,
     ) -> Deployment:
-        """A deployment of all nodes; raises ``ProjectError`` with all problems of the file.
+        """A deployment of all nodes.
 
-        ``here`` makes nodes ready that run on this machine; ``monitors_load``: whether the others
-        are to write their system load.
+        Args:
+            here: prepares the nodes of this machine.
+            monitors_load: whether the other machines record their load.
+
+        Raises:
+            ProjectError: with all problems of the file.
         """
 
     @abstractmethod
     def checks(self, file: Path, *, proves: bool) -> Iterable[Finding]:
-        """What ``neuros doctor`` finds of the machines of a file; ``proves``: with nodes there.
+        """Findings of ``neuros doctor`` about the machines of a file.
 
-        Raises ``ProjectError``, too.
+        ``proves``: start nodes there. Raises ``ProjectError``.
         """

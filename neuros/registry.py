@@ -1,18 +1,15 @@
-"""Registries: parts that NeuROS finds by a name, ours and those of other distributions.
+"""Registries: parts that NeuROS finds by name, its own and those of other distributions.
 
 A distribution registers a part as an entry point in its ``pyproject.toml``::
 
     [project.entry-points."neuros.backends"]
     slurm = "neuros_slurm:BACK_END"
 
-Ours stand in ``entry_points.txt`` beside this module, from where the build takes them, too. They
-are read there and not from the metadata of the installation, which is out of date in a checkout
-that was updated, and which takes some 10 ms to search.
+``entry_points.txt`` beside this module has NeuROS's own parts; the build reads it, too. The
+metadata of the installation would be out of date in an updated checkout, and its search takes some
+10 ms.
 
-``extensions.txt`` has the parts of NeuROS's own extensions, so that an error can say which one to
-install.
-
-Of back ends, ``--backend`` chooses one here (:func:`choose`).
+``extensions.txt`` has the parts of NeuROS's extensions, so that errors can name the one to install.
 """
 
 from __future__ import annotations
@@ -54,7 +51,7 @@ US = "neuros"
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry point: ``module:attribute``, or a module, and the distribution that has it."""
+    """An entry point: ``module:attribute``, or a module; and its distribution."""
 
     value: str
     distribution: str
@@ -66,13 +63,13 @@ class Entry:
 
 
 class Registry(Generic[Part]):
-    """The parts of one kind, loaded one by one when they are asked for.
+    """The parts of one kind; each is loaded at its first use.
 
     Args:
         group: of the entry points, as ``neuros.backends``.
-        noun: what such a part is, for messages.
-        kind: the class of which all are instances.
-        further: words that users may give besides the names of parts, as ``auto``.
+        noun: the word for a part, in messages.
+        kind: the class of all parts.
+        further: words that users may give in place of a name, as ``auto``.
     """
 
     def __init__(self, group: str, noun: str, kind: type[Any], further: Sequence[str] = ()) -> None:
@@ -83,27 +80,27 @@ class Registry(Generic[Part]):
         self._loaded: dict[str, Part] = {}
 
     def __iter__(self) -> Iterator[str]:
-        """All names, ours first. Raises ``EnvironmentFault`` if one is taken twice."""
+        """All names, NeuROS's first. Raises ``EnvironmentFault`` if two parts have one name."""
         yield from (*self._own, *self._others)
 
     def load(self, name: str) -> Part:
         """The part of this name.
 
         Raises:
-            UsageError: if there is none; it lists those that there are.
-            EnvironmentFault: if it cannot be loaded, or two distributions have one of this name.
+            UsageError: if there is none; the error lists all names.
+            EnvironmentFault: if it cannot be loaded, or two distributions have this name.
         """
         if name not in self._loaded:
             self._loaded[name] = self._load(name)
         return self._loaded[name]
 
     def value(self, name: str) -> str:
-        """What is loaded for a name, ``module:attribute`` or a module; empty if there is none."""
+        """``module:attribute``, or the module, of a name; empty if there is none."""
         entry = self._own.get(name) or self._others.get(name)
         return entry.value if entry else ""
 
     def missing(self, name: str) -> str:
-        """What to install for a part that one of NeuROS's extensions has; empty for others."""
+        """How to install the extension of NeuROS that has a part; empty for other names."""
         extension = dict(_rows(EXTENSIONS, self._group)).get(name)
         if extension is None or name in self:
             return ""
@@ -125,9 +122,9 @@ class Registry(Generic[Part]):
             )
         try:
             part = entry.load()
-        except EnvironmentFault:  # it says itself what it lacks
+        except EnvironmentFault:  # its text names what is missing
             raise
-        except Exception as error:  # whatever a module of another distribution may raise
+        except Exception as error:  # a module may raise anything
             raise self._fault(name, entry, f"cannot be loaded: {error!r}") from error
         if not isinstance(part, self._kind):
             raise self._fault(name, entry, f"is not a {self._kind.__name__}, but {part!r}")
@@ -166,7 +163,7 @@ class Registry(Generic[Part]):
 
 
 def _rows(file: Path, group: str) -> Iterator[tuple[str, str]]:
-    """The names and values of a section. configparser would take 2 ms in every node to import."""
+    """The names and values of a section. An import of configparser takes 2 ms per node."""
     _, _, section = file.read_text("utf-8").partition(f"[{group}]\n")
     for row in section.partition("\n[")[0].split("\n"):
         if row:
@@ -175,7 +172,7 @@ def _rows(file: Path, group: str) -> Iterator[tuple[str, str]]:
 
 
 AUTO = "auto"
-"""In place of the name of a back end: the best one that can be used."""
+"""The name for the best usable back end."""
 
 BACK_ENDS: Registry[BackEnd] = Registry("neuros.backends", "back end", BackEnd, further=[AUTO])
 DEPLOYMENTS: Registry[DeploymentKind] = Registry(
@@ -190,14 +187,14 @@ MODELS: Registry[ModelFormat] = Registry(
 )
 EXECUTORS: Registry[SweepExecutor] = Registry("neuros.executors", "executor", SweepExecutor)
 BAG_FORMATS: Registry[Callable[..., Any]] = Registry("neuros.bag_formats", "format", object)
-"""What methods of recorded topics and runs return in the types of other libraries."""
+"""Conversions of recorded topics and runs into types of other libraries."""
 PLUGIN_CHECKS: Registry[PluginCheck] = Registry("neuros.plugin_checks", "plugin", PluginCheck)
 
 
 class _Alias(Loader, MetaPathFinder):
-    """Lets a module of an extension be imported under its name in ``neuros``, too.
+    """Imports a module of an extension under a second name, in ``neuros``.
 
-    For a package it is also the finder of its modules: others would load those a second time.
+    It also finds the modules of a package: other finders would load them a second time.
     """
 
     def __init__(self, name: str, module: str) -> None:
@@ -232,7 +229,7 @@ def spec_of_name(name: str) -> ModuleSpec | None:
 
 
 def spec_of_alias(name: str, module: str) -> ModuleSpec | None:
-    """The spec of a module under a second name; it is not loaded again, nor before it is needed."""
+    """The spec of a module under a second name; the import loads the module once."""
     found = find_spec(module)
     if found is None:
         return None
@@ -244,7 +241,7 @@ def spec_of_alias(name: str, module: str) -> ModuleSpec | None:
 
 @dataclass(frozen=True)
 class Chosen:
-    """A back end, made ready, and what the user should know of the choice."""
+    """A back end, its deployment, and notices about the choice."""
 
     back_end: BackEnd
     deployment: Deployment
@@ -254,22 +251,38 @@ class Chosen:
 def choose(
     wanted: str, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
 ) -> Chosen:
-    """Make a back end ready for nodes: the one of that name, or for ``auto`` the best usable one.
+    """Prepare the back end of a name, or for ``auto`` the best usable one, for nodes.
 
     Args:
-        options: of the back end, by name; ``auto`` gives each of those that it tries its own.
+        options: of the back end, by name; with ``auto``, each back end gets those that it has.
 
     Raises:
-        UsageError: if there is none of that name, or it has no such option.
-        EnvironmentFault: if it lacks something, or for ``auto``, if every one of them does.
+        UsageError: if there is no such back end, or it has no such option.
+        EnvironmentFault: if something is missing; for ``auto``, for every back end.
     """
     if wanted != AUTO:
         back_end = BACK_ENDS.load(wanted)
-        _check_names(back_end, options)
+        known = [each.name for each in back_end.options]
+        for name in options:
+            if name not in known:
+                raise UsageError(
+                    f"the back end {back_end.name} has no option '{name}':"
+                    f" {', '.join(known) if known else 'it has none'}"
+                )
         return Chosen(back_end, back_end.prepare(project, nodes, option_values(back_end, options)))
-    candidates, notices = _candidates()
+    # The back ends by rank, highest first; broken ones become notices.
+    candidates: list[BackEnd] = []
+    notices: list[Notice] = []
+    for name in BACK_ENDS:
+        try:
+            candidates.append(BACK_ENDS.load(name))
+        except EnvironmentFault as fault:
+            notices.append(("WARN", str(fault)))
+    candidates.sort(key=lambda each: -(each.rank or 0))
     reasons: list[tuple[BackEnd, str]] = []
     for back_end in candidates:
+        if back_end.rank is None:
+            continue
         try:
             deployment = back_end.prepare(project, nodes, option_values(back_end, options))
         except EnvironmentFault as fault:
@@ -283,38 +296,13 @@ def choose(
     raise EnvironmentFault("\n".join(f"{other.name}: {reason}" for other, reason in reasons))
 
 
-def _check_names(back_end: BackEnd, options: Mapping[str, Any]) -> None:
-    known = [each.name for each in back_end.options]
-    for name in options:
-        if name not in known:
-            raise UsageError(
-                f"the back end {back_end.name} has no option '{name}':"
-                f" {', '.join(known) if known else 'it has none'}"
-            )
-
-
 def option_values(back_end: BackEnd, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The value of each option of a back end: what is given, the environment's, the default."""
+    """The value of each option of a back end, by name."""
     return {each.name: each.value(options.get(each.name)) for each in back_end.options}
 
 
-def _candidates() -> tuple[list[BackEnd], list[Notice]]:
-    """The back ends that ``auto`` tries, in this order, and notices on those that are broken."""
-    found: list[tuple[int, BackEnd]] = []
-    notices: list[Notice] = []
-    for name in BACK_ENDS:
-        try:
-            back_end = BACK_ENDS.load(name)
-        except EnvironmentFault as fault:
-            notices.append(("WARN", str(fault)))
-            continue
-        if back_end.rank is not None:
-            found.append((back_end.rank, back_end))
-    return [each for _, each in sorted(found, key=lambda pair: -pair[0])], notices
-
-
 def back_end_of(record: Mapping[str, Any]) -> BackEnd | None:
-    """The back end of a run that is over, by its ``run.json``; ``None`` if it is not registered."""
+    """The back end of a past run, by its ``run.json``; ``None`` if it is not registered."""
     try:
         return BACK_ENDS.load(record.get("backend", ""))
     except NeurosError:

@@ -1,9 +1,8 @@
-"""Stacks of plugins: of hooks that run for long, and of nodes that are killed.
+"""Stacks of plugins: of long hooks, and of nodes that are killed.
 
-A node that reports tells its own (:func:`stack_in`). One that does not, since a library holds
-Python's global lock or its process was stopped, cannot: then py-spy reads from outside where its
-threads stand (:func:`threads_of`). It only reads memory, so it changes nothing in the node;
-faulthandler, which writes stacks from inside, may crash a node that goes on meanwhile.
+A node reads its own stack (:func:`stack_in`). If a library holds Python's global lock, or the
+process is stopped, py-spy reads the stacks from outside (:func:`threads_of`). It only reads memory,
+and does not disturb the node; faulthandler, which writes stacks from inside, may crash it.
 """
 
 from __future__ import annotations
@@ -17,15 +16,14 @@ import threading
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 LONG_S = 5.0
-"""A hook that runs for this long is named."""
+"""A hook that runs for this many seconds is reported."""
 
 IMPORT = "<module>"
-"""What Python calls the function of a module that is imported, in stacks."""
+"""The name of a module's own code in stacks, as while it is imported."""
 
 _READ_S = 2.0
 _MOST_FRAMES = 100  # shown, as by faulthandler
@@ -37,7 +35,7 @@ _INIT = 1
 
 @dataclass(frozen=True)
 class Stack:
-    """The calls from a hook on, the most recent last, as Python shows them."""
+    """The calls from a hook on, the most recent last, in Python's format."""
 
     node: str
     hook: str
@@ -50,8 +48,8 @@ class Thread:
 
     Attributes:
         name: in Python.
-        is_main: whether it is the one in which hooks run.
-        has_lock: whether it held Python's global lock when it was read.
+        is_main: whether hooks run in the thread.
+        has_lock: whether the thread held Python's global lock.
         frames: file, line and function of each call, the most recent last.
     """
 
@@ -67,11 +65,11 @@ class Thread:
 
 @dataclass(frozen=True)
 class ProcessThreads:
-    """Where the threads of a process stand in Python.
+    """The stacks of the threads of a process.
 
     Attributes:
-        stopped: why none of them goes on ("the process is stopped"); empty if they may.
-        problem: why they could not be read; empty if they could.
+        stopped: why no thread runs ("the process is stopped"); empty if they may.
+        problem: why the stacks could not be read; empty if they could.
     """
 
     threads: tuple[Thread, ...] = ()
@@ -87,7 +85,7 @@ class ProcessThreads:
         return next((each for each in self.threads if each.has_lock), None)
 
     def hook_stack(self, node: str, plugin: str) -> Stack | None:
-        """The stack of the main thread in the plugin of a node, whose file this is."""
+        """The stack of the main thread from the file ``plugin`` on; ``None`` outside of it."""
         frames = next((each.frames for each in self.threads if each.is_main), ())
         for place, (path, _, name) in enumerate(frames):
             if path == plugin:
@@ -96,10 +94,15 @@ class ProcessThreads:
 
 
 def threads_of(pid: int) -> ProcessThreads:
-    """Read where the threads of a process on this machine stand; takes up to 2 s."""
-    import subprocess  # no node needs it, and each would take 5 ms to import it
+    """Read the stacks of a process on this machine; takes up to 2 s."""
+    import importlib.metadata as metadata
+    import subprocess  # an import takes 5 ms, in nodes that do not need it
 
-    command = [_py_spy(), "dump", "--nonblocking", "--json", "--pid", str(pid)]
+    program = "py-spy"
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        found = (path for path in metadata.files("py-spy") or () if path.name == "py-spy")
+        program = next((str(path.locate()) for path in found), program)
+    command = [program, "dump", "--nonblocking", "--json", "--pid", str(pid)]
     try:
         done = subprocess.run(
             command,
@@ -107,7 +110,7 @@ def threads_of(pid: int) -> ProcessThreads:
             capture_output=True,
             timeout=_READ_S,
             check=False,
-            start_new_session=True,  # Ctrl+C is not for it
+            start_new_session=True,  # keeps Ctrl+C away
         )
         if done.returncode:
             said = done.stderr.decode(errors="replace").partition("\n")[0]
@@ -126,10 +129,10 @@ def threads_of(pid: int) -> ProcessThreads:
 
 
 def allow_reading() -> None:
-    """Let :func:`threads_of` read this process where Yama would allow it to ancestors only.
+    """Let :func:`threads_of` read this process although Yama allows ancestors only.
 
-    Then the launcher may, and its children; it has started the reaper, which has started this
-    process. In a container, where that is not to be seen, any process of the same user may.
+    The launcher and its children may: the launcher starts the reaper, which starts this process. In
+    a container, where the launcher is invisible, any process of the same user may.
     """
     reader = _ANY
     with contextlib.suppress(OSError), open(f"/proc/{os.getppid()}/stat", "rb") as file:
@@ -140,7 +143,7 @@ def allow_reading() -> None:
 
 
 def stack_in(node: str, plugin: Path) -> Stack | None:
-    """The stack of the main thread in a plugin, ``None`` outside of it. Any other thread."""
+    """The stack of the main thread from a plugin on, ``None`` outside of it. Other threads."""
     frame = sys._current_frames().get(threading.main_thread().ident or 0)
     frames = traceback.extract_stack(frame) if frame else []
     for place, each in enumerate(frames):
@@ -150,28 +153,16 @@ def stack_in(node: str, plugin: Path) -> Stack | None:
     return None
 
 
-@cache
-def _py_spy() -> str:
-    """The path of the program."""
-    from importlib.metadata import PackageNotFoundError, files
-
-    with contextlib.suppress(PackageNotFoundError):
-        for path in files("py-spy") or ():
-            if path.name == "py-spy":
-                return str(path.locate())
-    return "py-spy"
-
-
 def _thread(told: Mapping[str, Any], pid: int) -> Thread:
-    """A thread as py-spy tells of it, with the most recent call first."""
+    """A thread from py-spy's report, which has the most recent call first."""
     frames = [(f["filename"], f["line"], f["name"].rpartition(".")[2]) for f in told["frames"]]
-    name = told["thread_name"] or ""  # which the module threading gives, if it is loaded
+    name = told["thread_name"] or ""  # empty if the module threading is not loaded
     is_main = name == _MAIN_THREAD or told["os_thread_id"] == pid
     return Thread(name or "a thread", is_main, told["owns_gil"], (*reversed(frames),))
 
 
 def _text(frames: Sequence[tuple[str, int, str]]) -> str:
-    """As Python shows calls, but without their source: a node says which files these are."""
+    """Calls in Python's format without source lines: the files may be elsewhere."""
     lines = [f'  File "{path}", line {line}, in {name}' for path, line, name in frames]
     if len(lines) > _MOST_FRAMES:
         lines[1 : 1 - _MOST_FRAMES] = [f"  [{len(lines) - _MOST_FRAMES} calls are left out]"]
