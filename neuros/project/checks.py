@@ -21,7 +21,7 @@ from neuros.project.message_types import normalised
 from neuros.project.model import Connection, Node
 from neuros.project.names import INTERNAL, MOST_CHARACTERS
 from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
-from neuros.project.plugin_files import DeclaredHook, Remark, read_plugin
+from neuros.project.plugin_files import PluginHook, Remark, read_plugin
 from neuros.project.scanner import Element
 from neuros.project.suggest import did_you_mean
 from neuros.project.validate import MOST_PROBLEMS
@@ -374,7 +374,7 @@ def plugin_problems(
 
 
 def _misfits(
-    hook: DeclaredHook, node: Node, connections: Sequence[Connection] | None
+    hook: PluginHook, node: Node, connections: Sequence[Connection] | None
 ) -> Iterator[Remark]:
     """Ports of a hook that its node does not have, and required inputs without a connection."""
     if hook.sim_tick is not None:

@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 
 from neuros.errors import Problem
 from neuros.project.model import Connection, Node, Project
-from neuros.project.plugin_files import DeclaredHook, DeclaredPort, PluginFile, read_plugin
+from neuros.project.plugin_files import PluginFile, PluginHook, PluginPort, read_plugin
 from neuros.project.scanner import display_name
 
 _Key = TypeVar("_Key", bound=Hashable)
@@ -51,10 +51,10 @@ class _Hook(NamedTuple):
     """A hook of a node that an engine runs."""
 
     node: str
-    declared: DeclaredHook
+    declared: PluginHook
 
     @property
-    def needed(self) -> list[DeclaredPort]:
+    def needed(self) -> list[PluginPort]:
         """The required inputs."""
         return [port for port in self.declared.inputs or () if not port.is_optional]
 
@@ -139,13 +139,13 @@ class Loops:
 
     # ------------------------------------------------------------------ inside
 
-    def _needs(self, hook: _Hook) -> list[DeclaredPort]:
+    def _needs(self, hook: _Hook) -> list[PluginPort]:
         clock = self._nodes[hook.node].clock
         if hook.declared.sim_tick is None or clock is None:
             return hook.needed
-        return [*hook.needed, DeclaredPort(clock.name, *hook.declared.sim_tick)]
+        return [*hook.needed, PluginPort(clock.name, *hook.declared.sim_tick)]
 
-    def _lacks(self, node: str, port: DeclaredPort) -> list[Connection]:
+    def _lacks(self, node: str, port: PluginPort) -> list[Connection]:
         """The connections of an input that bring nothing, if the input gets no packet therefore."""
         ends = self._to.get((node, port.name or ""), [])
         silent = [
@@ -185,7 +185,7 @@ class Loops:
         return Loop(tuple(nodes), started_by or (() if is_known else None), may_stop_at)
 
 
-def _hooks_of(node: Node) -> Sequence[DeclaredHook] | None:
+def _hooks_of(node: Node) -> Sequence[PluginHook] | None:
     """The hooks of a node; ``None`` if it may have others, or sends packets without hooks."""
     plugin = None if node.plugin.name == "" else read_plugin(node.plugin)
     if plugin is None or not plugin.is_whole or plugin.mistakes:

@@ -19,7 +19,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from neuros import hooks
+import neuros.hooks
 from neuros.errors import Problem
 from neuros.hooks import InputSpec, input_of, output_of, period_of
 from neuros.project.scanner import display_name, read_bytes
@@ -28,11 +28,11 @@ from neuros.project.suggest import did_you_mean
 _MOST_BYTES = 4 << 20
 _HOOKS = "neuros.hooks"
 _ARGUMENTS = {
-    name: tuple(inspect.signature(getattr(hooks, name)).parameters)
-    for name in hooks.__all__
+    name: tuple(inspect.signature(getattr(neuros.hooks, name)).parameters)
+    for name in neuros.hooks.__all__
     if name.startswith("neuros_")
 }
-_WRAPPERS = {"All": hooks.All, "Optional": hooks.Optional}
+_WRAPPERS = {"All": neuros.hooks.All, "Optional": neuros.hooks.Optional}
 
 # Packages whose functions are no hooks; a function of any other package may be one.
 _WITHOUT_HOOKS = {"matplotlib", "mujoco", "nest", "neuros", "numpy", "rclpy", "scipy"}
@@ -69,7 +69,7 @@ class Remark:
 
 
 @dataclass(frozen=True)
-class DeclaredPort:
+class PluginPort:
     """A port as a hook names it; ``name`` is ``None`` where it is computed."""
 
     name: str | None
@@ -80,7 +80,7 @@ class DeclaredPort:
 
 
 @dataclass(frozen=True)
-class DeclaredHook:
+class PluginHook:
     """A hook that the plugin has in any case.
 
     Attributes:
@@ -90,8 +90,8 @@ class DeclaredHook:
     """
 
     name: str
-    inputs: tuple[DeclaredPort, ...] | None
-    outputs: tuple[DeclaredPort, ...] | None
+    inputs: tuple[PluginPort, ...] | None
+    outputs: tuple[PluginPort, ...] | None
     sim_tick: tuple[int, int] | None = None
     kind: str = ""
 
@@ -124,7 +124,7 @@ class PluginFile:
     """
 
     path: Path
-    hooks: list[DeclaredHook] = field(default_factory=list)
+    hooks: list[PluginHook] = field(default_factory=list)
     mistakes: list[Remark] = field(default_factory=list)
     doubts: list[Remark] = field(default_factory=list)
     imports: frozenset[str] = frozenset()
@@ -211,8 +211,8 @@ class _Reader:
                     lines[name] = line
             elif isinstance(statement, ast.ImportFrom) and _module(statement) == _HOOKS:
                 for alias in statement.names:
-                    if alias.name not in ("*", *hooks.__all__):
-                        hint = did_you_mean(alias.name, hooks.__all__)
+                    if alias.name not in ("*", *neuros.hooks.__all__):
+                        hint = did_you_mean(alias.name, neuros.hooks.__all__)
                         self._mistake(statement, f"neuros.hooks has no '{alias.name}'", hint)
         attributes = [each for each in nodes if isinstance(each, ast.Attribute)]
         names = [each for each in nodes if isinstance(each, ast.Name)]
@@ -282,7 +282,7 @@ class _Reader:
         if not isinstance(expression, ast.Name):
             return ""
         origins = self._origins.get(expression.id, set())
-        if not origins and self._stars == [_HOOKS] and expression.id in hooks.__all__:
+        if not origins and self._stars == [_HOOKS] and expression.id in neuros.hooks.__all__:
             return f"{_HOOKS}.{expression.id}"
         return next(iter(origins)) if len(origins) == 1 else ""
 
@@ -293,7 +293,7 @@ class _Reader:
             return name
         if not isinstance(expression, ast.Name) or self._stars:
             return ""
-        if expression.id not in hooks.__all__ or expression.id in self._origins:
+        if expression.id not in neuros.hooks.__all__ or expression.id in self._origins:
             return ""
         import_ = f"from neuros.hooks import {expression.id}"
         self._mistake(expression, f"'{expression.id}' is not imported", import_)
@@ -350,8 +350,8 @@ class _Reader:
                 self._mistake(function, text, "a hook returns its packets")
         return any(kind in _ARGUMENTS for kind in kinds)
 
-    def _hook(self, function: _Function, decorator: ast.expr, kind: str) -> DeclaredHook:
-        unknown = DeclaredHook(function.name, None, None, kind=kind)
+    def _hook(self, function: _Function, decorator: ast.expr, kind: str) -> PluginHook:
+        unknown = PluginHook(function.name, None, None, kind=kind)
         if not isinstance(decorator, ast.Call):
             self._fail(function, decorator, f"@{kind} needs parentheses")
             return unknown
@@ -373,7 +373,7 @@ class _Reader:
                 given[keyword.arg] = keyword.value
         if not is_known:
             return unknown
-        return DeclaredHook(
+        return PluginHook(
             function.name,
             self._ports(function, given.get("inputs"), "input"),
             self._ports(function, given.get("outputs"), "output"),
@@ -404,7 +404,7 @@ class _Reader:
 
     def _ports(
         self, function: _Function, written: ast.expr | None, side: str
-    ) -> tuple[DeclaredPort, ...] | None:
+    ) -> tuple[PluginPort, ...] | None:
         """The ports of one side; ``None`` where even their number is computed."""
         if written is None or (isinstance(written, ast.Constant) and written.value is None):
             return ()
@@ -412,7 +412,7 @@ class _Reader:
         entries = written.elts if isinstance(written, ast.List | ast.Tuple | ast.Set) else [written]
         if any(isinstance(entry, ast.Starred | ast.Dict) for entry in entries):
             return None  # the keys of a dict are ports
-        found: list[DeclaredPort] = []
+        found: list[PluginPort] = []
         for entry in entries:
             place = entry.lineno, entry.col_offset + 1
             try:
@@ -420,7 +420,7 @@ class _Reader:
             except (TypeError, ValueError):
                 if not is_list:
                     return None  # it may be a list of ports
-                found.append(DeclaredPort(None, *place))
+                found.append(PluginPort(None, *place))
                 continue
             try:
                 spec = input_of(value) if side == "input" else output_of(value)
@@ -430,10 +430,10 @@ class _Reader:
                 self._fail(function, entry, str(error))
                 return None
             is_all = isinstance(spec, InputSpec) and spec.is_all
-            found.append(DeclaredPort(spec.name, *place, is_all, spec.is_optional))
+            found.append(PluginPort(spec.name, *place, is_all, spec.is_optional))
         return tuple(found)
 
-    def _check_signature(self, function: _Function, inputs: Sequence[DeclaredPort]) -> None:
+    def _check_signature(self, function: _Function, inputs: Sequence[PluginPort]) -> None:
         """Whether it can be called with the node and its inputs."""
         takes = function.args
         plain = [each.arg for each in (*takes.posonlyargs, *takes.args)]

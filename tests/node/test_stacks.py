@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 
 from containers import wait_until
-from neuros import stacks
 from neuros.stacks import ProcessThreads, Thread, stack_in, threads_of
 
 PLUGIN = """\
@@ -113,7 +112,8 @@ def test_why_nothing_could_be_read_is_told(monkeypatch: pytest.MonkeyPatch) -> N
         )
         process.kill()
     assert threads_of(process.pid).problem.startswith("py-spy: Failed to get process executable")
-    monkeypatch.setattr(stacks, "_py_spy", lambda: "nowhere")
+    monkeypatch.setattr("importlib.metadata.files", lambda _: None)
+    monkeypatch.setenv("PATH", "/nowhere")
     assert threads_of(os.getpid()).problem.startswith("py-spy is not installed")
 
 
