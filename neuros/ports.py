@@ -574,6 +574,14 @@ class Finding:
         return f"{self.state.value:<8} {self.subject:<12} {self.text}{remedy}"
 
 
+class MachineCheck(ABC):
+    """Checks this machine for ``neuros doctor``. An entry point of the group ``neuros.checks``."""
+
+    @abstractmethod
+    def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
+        """What ``neuros doctor`` finds."""
+
+
 @dataclass(frozen=True)
 class Subcommand:
     """A command of ``neuros``. Registered as an entry point of the group ``neuros.commands``.

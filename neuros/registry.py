@@ -33,6 +33,7 @@ from neuros.ports import (
     Deployment,
     DeploymentKind,
     LaunchExtension,
+    MachineCheck,
     ModelFormat,
     Notice,
     PluginCheck,
@@ -188,6 +189,7 @@ MODELS: Registry[ModelFormat] = Registry(
 EXECUTORS: Registry[SweepExecutor] = Registry("neuros.executors", "executor", SweepExecutor)
 BAG_FORMATS: Registry[Callable[..., Any]] = Registry("neuros.bag_formats", "format", object)
 """Conversions of recorded topics and runs into types of other libraries."""
+CHECKS: Registry[MachineCheck] = Registry("neuros.checks", "check", MachineCheck)
 PLUGIN_CHECKS: Registry[PluginCheck] = Registry("neuros.plugin_checks", "plugin", PluginCheck)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from distributions import path_with
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -189,3 +190,31 @@ def test_a_sensor_touches_one_file(checkout: Checkout) -> None:
         "assert abs(energy - 0.5 * 2.0 * 1.0**2) < 1e-6, energy\n"  # 0.1 s at 10 m/s^2
     )
     checkout.run("-c", program)
+
+
+def test_an_extension_adds_a_command_an_option_of_launch_and_a_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    diary = tmp_path / "diary.txt"
+    monkeypatch.setenv("PYTHONPATH", path_with(tmp_path / "site", "neuros_diary"))
+    monkeypatch.setenv("DIARY", str(diary))
+    project = str(ROOT / "examples/1_tick/clock")
+    launch = ("launch", project, "--backend", "in-process", "--duration", "0.1")
+    neuros("doctor", "--no-delivery", prints=f"ok       diary        {diary}")
+    neuros("--help", prints="print the diary of runs")
+    neuros("launch", "--help", prints="--diary TEXT")
+    neuros(*launch, "--diary", "it ticks", "-o", str(tmp_path / "run"), prints="0.1 s are over")
+    neuros("diary", "ticks", prints=f"clock: it ticks ({tmp_path / 'run'})\n")
+
+    monkeypatch.setenv("DIARY", "/nowhere/diary.txt")
+    wrong = "/nowhere/diary.txt cannot be written: set DIARY to another file"
+    neuros("doctor", "--no-delivery", prints=wrong, exit_code=4)
+    neuros(*launch, "--diary", "no", prints=f"neuros: --diary: {wrong}", exit_code=4)
+
+
+def neuros(*arguments: str, prints: str, exit_code: int = 0) -> None:
+    """Call a command, which prints this among other lines."""
+    command = [sys.executable, "-m", "neuros.cli", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == exit_code, done.stdout + done.stderr
+    assert prints in done.stdout + done.stderr

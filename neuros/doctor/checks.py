@@ -25,9 +25,9 @@ from neuros.backends.node_command import usable_cores
 from neuros.distribution import install_command, python_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine, answer_of, install_opengl, offscreen_opengl
-from neuros.ports import BackEnd, Finding, State
+from neuros.ports import Finding, State
 from neuros.recording.run_file import read_run_file
-from neuros.registry import BACK_ENDS, option_values
+from neuros.registry import BACK_ENDS, CHECKS, Part, Registry, option_values
 from neuros.stacks import allow_reading, threads_of
 
 PROJECT = Path(__file__).with_name("delivery")
@@ -48,8 +48,11 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
     """
     yield from look_at_machine(environ)
     yield from look_at_simulators(environ)
-    back_ends, broken = _back_ends()
-    yield from broken
+    checks, broken_checks = _parts(CHECKS)
+    back_ends, broken_back_ends = _parts(BACK_ENDS)
+    yield from (*broken_checks, *broken_back_ends)
+    for check in checks:
+        yield from check.checks(environ)
     for back_end in back_ends:
         yield from back_end.checks(environ)
     if not proves:
@@ -66,18 +69,18 @@ def findings(environ: Mapping[str, str], *, proves: bool) -> Iterator[Finding]:
             yield prove_delivery(back_end.name)
 
 
-def _back_ends() -> tuple[list[BackEnd], list[Finding]]:
-    """The back ends that can be loaded, and findings about the others."""
-    loaded: list[BackEnd] = []
+def _parts(registry: Registry[Part]) -> tuple[list[Part], list[Finding]]:
+    """The parts of a registry that can be loaded, and findings about the others."""
+    loaded: list[Part] = []
     broken: list[Finding] = []
     try:
-        for name in BACK_ENDS:
+        for name in registry:
             try:
-                loaded.append(BACK_ENDS.load(name))
+                loaded.append(registry.load(name))
             except EnvironmentFault as fault:
-                broken.append(Finding.bad(BACK_ENDS.noun, str(fault)))
+                broken.append(Finding.bad(registry.noun, str(fault)))
     except EnvironmentFault as fault:  # two distributions share a name
-        broken.append(Finding.bad(BACK_ENDS.noun, str(fault)))
+        broken.append(Finding.bad(registry.noun, str(fault)))
     return loaded, broken
 
 

@@ -2,43 +2,23 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from back_end_checks import BackEndChecks, Launched, finish, launcher
+from distributions import install, path_with
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
-
-DISTRIBUTION = Path(__file__).parents[1] / "distributions" / "neuros_nice"
 CLOCK = Path(__file__).parents[2] / "examples/1_tick/clock"
-
-
-def install(site: Path, name: str, parts: Mapping[str, Mapping[str, str]]) -> None:
-    """Put the metadata of a distribution where Python finds them, as pip does."""
-    info = site / f"{name.replace('-', '_')}-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
-    rows: list[str] = []
-    for group, values in parts.items():
-        rows += [f"[{group}]\n", *(f"{key} = {value}\n" for key, value in values.items())]
-    (info / "entry_points.txt").write_text("".join(rows))
 
 
 @pytest.fixture(autouse=True)
 def installed(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder in which Python finds the distribution, for programs that are started."""
     site = tmp_path_factory.mktemp("site")
-    project = tomllib.loads((DISTRIBUTION / "pyproject.toml").read_text())["project"]
-    install(site, project["name"], project["entry-points"])
-    paths = [str(site), str(DISTRIBUTION), os.environ.get("PYTHONPATH", "")]
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, paths)))
+    monkeypatch.setenv("PYTHONPATH", path_with(site, "neuros_nice"))
     return site
 
 
