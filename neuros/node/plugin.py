@@ -108,7 +108,7 @@ def _hint(error: BaseException) -> str:
         top = error.name.partition(".")[0]
         return (
             f"packages such as {top} go into the requirements.txt of the node's container, modules"
-            " of your own beside the plugin: docs/environments.md"
+            " of your own beside the plugin: docs/containers.md#environments-without-docker"
         )
     frames = traceback.extract_tb(error.__traceback__)
     if any(frame.name == "get_global_executor" for frame in frames):  # by rclpy.spin and the like
