@@ -597,7 +597,8 @@ def test_what_is_not_looked_for_in_the_current_folder_has_no_such_hint(plugin, b
 def test_a_missing_module_names_where_packages_go(plugin, is_in_hook):
     hint = (
         "No module named 'brian9' (packages such as brian9 go into the requirements.txt of the"
-        " node's container, modules of your own beside the plugin: docs/containers.md#environments-without-docker)"
+        " node's container, modules of your own beside the plugin:"
+        " docs/containers.md#environments-without-docker)"
     )
     if is_in_hook:
         assert failing(plugin, "import brian9.units").endswith(hint)

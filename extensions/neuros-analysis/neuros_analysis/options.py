@@ -1,4 +1,4 @@
-"""Options of ``neuros sweep``, which are arguments of :func:`neuros.sweep`, too."""
+"""Options of ``neuros sweep``, which are arguments of ``neuros.sweep``, too."""
 
 from __future__ import annotations
 
