@@ -199,7 +199,8 @@ def _lacking(
                     f"did you mean '{close[0]}'?"
                     if close
                     else f"packages such as {top} go into the requirements.txt of the node's"
-                    " container, modules of your own beside the plugin: docs/containers.md#environments-without-docker"
+                    " container, modules of your own beside the plugin:"
+                    " docs/containers.md#environments-without-docker"
                 )
             if text:
                 place = needed.line, needed.column
