@@ -20,9 +20,9 @@ from neuros.transport.schema import Field, Shape, Sort, schema
 from neuros.transport.values import (
     Convert,
     Mismatch,
-    buffer_converter,
-    numbers_converter,
+    converter,
     single_converter,
+    to_numbers,
 )
 
 _Put = Callable[[Any, Any], None]
@@ -85,7 +85,7 @@ def _refusing(path: str, convert: Convert) -> Convert:
 
 def _to_sequence(field: Field) -> Convert:
     """A function that makes an ``array.array`` of all that ROS makes one of."""
-    code, convert_other = field.type.code, buffer_converter(field)
+    code, convert_other = field.type.code, converter(field)
 
     def convert(value: Any) -> Any:
         is_memory = isinstance(value, bytes | bytearray)
@@ -106,8 +106,7 @@ def _to_array(field: Field) -> Convert:
     """A function that makes an array of NumPy, of matrices, too: their shape is kept."""
     import numpy  # here: most messages have no such field, and the import takes 70 ms
 
-    code, to_numbers = field.type.code, numbers_converter(field)
-    dtype = numpy.dtype(code)
+    code, dtype = field.type.code, numpy.dtype(field.type.code)
 
     def convert(value: Any) -> Any:
         if isinstance(value, list | tuple):
@@ -115,7 +114,7 @@ def _to_array(field: Field) -> Convert:
                 return numpy.array(made)
             if all(isinstance(row, list | tuple | numpy.ndarray) for row in value):
                 return numpy.array([convert(row) for row in value], dtype)
-        return numpy.array(to_numbers(value), dtype)
+        return numpy.array(to_numbers(field, value), dtype)
 
     return convert
 

@@ -2,12 +2,12 @@
 
 rclpy trusts the types of fields when it serialises: an ``int`` in a ``float64`` arrives as 1e-323,
 300 in a ``uint8`` as 44. So each packet is checked once, when a hook has returned it, before it is
-sent, recorded or digested on any back end. What fits is converted in place: a number to the one of
-Python that the field can hold (rounded, for a ``float32``), a tuple to a list, and so on. Nothing
-changes a value afterwards, on any way. All else raises :class:`~neuros.errors.WrongValue`.
+sent, recorded or digested on any back end. Values that fit are converted in place: a number to the
+one of Python that the field can hold (rounded, for a ``float32``), a tuple to a list, and so on.
+All others raise :class:`~neuros.errors.WrongValue`. Nothing changes a value afterwards.
 
-Most messages need no conversion. That is found out for all fields together; only otherwise is each
-one looked at, and converted or refused.
+Most messages need no conversion. :func:`_exactness` tells so for all fields together. Only the
+others go field by field through the tables ``_SINGLE`` and ``_SEVERAL``, which convert or refuse.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ import struct
 import sys
 from array import array
 from collections.abc import Callable, KeysView, Sequence, ValuesView
-from functools import cache
+from functools import cache, partial
 from itertools import chain
-from operator import attrgetter
+from operator import attrgetter, is_
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy
 
 from neuros.errors import WrongValue
-from neuros.transport.schema import Field, Leaf, Path, Shape, Sort, Type, getter, schema
+from neuros.transport.schema import Field, Shape, Sort, Type, getter, schema
 
 Check: TypeAlias = Callable[[Any], Any]
 Convert: TypeAlias = Callable[[Any], Any]
@@ -35,11 +35,10 @@ IsExact: TypeAlias = Callable[[Any], bool]
 _NOTHING = object()
 _PLAIN = "?bBhHiIlLqQefd"  # numbers of NumPy that Python has, too
 _FLOAT = struct.Struct("<f")
-_TEXTS = (Sort.TEXT, Sort.WIDE_TEXT)
-_KINDS: dict[Sort, type] = {
-    Sort.BOOL: bool, Sort.INTEGER: int, Sort.FLOAT: float, Sort.BYTE: bytes,
-    Sort.CHARACTER: str, Sort.TEXT: str, Sort.WIDE_TEXT: str,
-}  # fmt: skip
+_RANGES = {code: range(2**bits) for code, bits in zip("BHIQ", (8, 16, 32, 64), strict=True)} | {
+    code: range(-(2**bits), 2**bits) for code, bits in zip("bhiq", (7, 15, 31, 63), strict=True)
+}
+"""Values of an integer, by the code that ``struct`` has for its type."""
 _REPR = reprlib.Repr()
 _REPR.maxother = 60
 
@@ -51,7 +50,7 @@ def checker(kind: Any) -> Check:
     It returns the message, converted in place where need be, or one of that very class in place of
     one of a derived class. It raises :class:`~neuros.errors.WrongValue`.
     """
-    is_exact, convert = _exactness(kind).of_one, _convert_message(kind)
+    is_exact, convert = _exactness(kind).of_one, _message_converter(kind)
 
     def check(message: Any) -> Any:
         if type(message) is kind and is_exact(message):
@@ -65,26 +64,26 @@ def checker(kind: Any) -> Check:
 
 
 class Mismatch(Exception):
-    """A wrong value, with the steps that lead to it from where it has come to so far."""
+    """A value that cannot be converted; ``path`` leads to it from the one being converted."""
 
     def __init__(self, found: str, allowed: str, path: str = "") -> None:
         super().__init__()
         self.found, self.allowed, self.path = found, allowed, path
 
     def within(self, step: str) -> Mismatch:
-        """This error, seen from one step further out."""
+        """This error for the message or list that has the value being converted at ``step``."""
         is_first = not self.path or self.path.startswith("[")
         self.path = step + self.path if is_first else f"{step}.{self.path}"
         return self
 
 
-# ---------------------------------------------------------------------- right already
+# ---------------------------------------------------------------------- messages to leave as is
 
 
 class _Exactness(NamedTuple):
-    """Checks whether the fields of a message, or of several, hold what a receiver would see.
+    """Tells whether messages of a class hold what a receiver would see, and need no conversion.
 
-    A ``float32`` between two that there are is rounded on the way: most are, in simulators.
+    Numbers for ``float32`` are rounded on the way: most need that, in simulators.
     """
 
     of_one: IsExact
@@ -94,177 +93,149 @@ class _Exactness(NamedTuple):
 @cache
 def _exactness(kind: Any) -> _Exactness:
     layout = schema(kind)
-    # Sorted so that each group is a slice of all values, which are got in one go.
+    # Sorted so that single integers and float32 are one slice of all values.
     leaves = sorted(layout.leaves, key=lambda leaf: _group(leaf.field))
+    groups = [_group(leaf.field) for leaf in leaves]
+    rules = [_exact(leaf.field) for leaf in leaves]
     get = getter([*layout.places[1:], *(leaf.path for leaf in leaves)])
-    kinds = (*layout.kinds[1:], *(_kind_of(leaf.field) for leaf in leaves))
-    is_in_range = _is_in_range(leaves, len(kinds))
+    classes = (*layout.kinds[1:], *(found for found, _ in rules))
+    begin = len(layout.kinds) - 1
+    first_float = begin + groups.count(_INTEGERS)
+    end = first_float + groups.count(_FLOATS)
+    packed = struct.Struct("<" + "".join(leaf.field.type.code for leaf in leaves[: end - begin]))
+    pack, unpack = packed.pack, packed.unpack
+    float_slots = [
+        (attrgetter(".".join(path)) if path else None, slot)
+        for *path, slot in (leaf.path for leaf in leaves[first_float - begin : end - begin])
+    ]
+    checks = tuple(
+        (place, check)
+        for place, (_, check) in enumerate(rules, begin)
+        if check is not None and place >= end
+    )
+    has_conditions = bool(end > begin or checks)
+
+    def meets_conditions(message: Any, found: tuple[Any, ...]) -> bool:
+        """Whether values of the right classes are right, too."""
+        try:
+            data = pack(*found[begin:end])
+        except (struct.error, OverflowError):
+            return False
+        if float_slots and (rounded := unpack(data)) != found[begin:end]:
+            floats = rounded[first_float - begin :]
+            for (holder, slot), value in zip(float_slots, floats):  # noqa: B905, it costs time
+                setattr(holder(message) if holder else message, slot, value)
+        for place, check in checks:  # noqa: SIM110, a generator takes thrice as long
+            if not check(found[place]):
+                return False
+        return True
 
     def is_exact(message: Any) -> bool:
         try:
             found = get(message)
         except AttributeError:
             return False
-        if tuple(map(type, found)) != kinds:
+        if tuple(map(type, found)) != classes:
             return False
-        return is_in_range is None or is_in_range(message, found)
+        return not has_conditions or meets_conditions(message, found)
 
     def are_exact(messages: list[Any]) -> bool:
         try:
             found = list(map(get, messages))
         except AttributeError:
             return False
-        if list(map(type, chain.from_iterable(found))) != [*kinds] * len(messages):
+        if list(map(type, chain.from_iterable(found))) != [*classes] * len(messages):
             return False
-        return is_in_range is None or all(map(is_in_range, messages, found))
+        return not has_conditions or all(map(meets_conditions, messages, found))
 
-    if len(kinds) == len(leaves) == 1 and _group(leaves[0].field) != 1:
-        return _Exactness(_is_exact_single(leaves[0].field), are_exact)
+    if len(classes) == len(leaves) == 1 and groups != [_FLOATS]:
+        return _Exactness(_of_single_field(leaves[0].path[0], *rules[0]), are_exact)
     return _Exactness(is_exact, are_exact)
 
 
-def _is_exact_single(field: Field) -> IsExact:
+_INTEGERS, _FLOATS, _OTHERS = range(3)
+
+
+def _group(field: Field) -> int:
+    if field.shape is Shape.SINGLE and field.type.sort is Sort.INTEGER:
+        return _INTEGERS
+    return _FLOATS if field.shape is Shape.SINGLE and field.type.code == "f" else _OTHERS
+
+
+def _of_single_field(slot: str, expected: type, is_exact_value: IsExact | None) -> IsExact:
     """For messages with this field only, as most of ``std_msgs`` are: in half the time."""
-    get, kind, check = attrgetter(field.slot), _kind_of(field), _is_exact_field(field)
-    if _group(field) == 0:
-        check = _range_of(field.type).__contains__
+    get = attrgetter(slot)
 
     def is_exact(message: Any) -> bool:
         try:
             value = get(message)
         except AttributeError:
             return False
-        return type(value) is kind and (check is None or check(value))
+        return type(value) is expected and (is_exact_value is None or is_exact_value(value))
 
     return is_exact
 
 
-def _is_in_range(
-    leaves: Sequence[Leaf], count: int
-) -> Callable[[Any, tuple[Any, ...]], bool] | None:
-    """For a message with values of the right classes, those of ``leaves`` last.
-
-    ``None`` if any will do.
-    """
-    groups = [_group(leaf.field) for leaf in leaves]
-    begin = count - len(leaves)
-    between = begin + groups.count(0)
-    end = between + groups.count(1)
-    integers = struct.Struct(
-        "<" + "".join(leaf.field.type.code for leaf in leaves[: groups.count(0)])
-    )
-    floats = struct.Struct(f"<{groups.count(1)}f")
-    pack_integers, pack, unpack = integers.pack, floats.pack, floats.unpack
-    has_integers, has_floats = between > begin, end > between
-    setters = [_setter(leaf.path) for leaf in leaves[between - begin : end - begin]]
-    checks = tuple(
-        (begin + place, check)
-        for place, leaf in enumerate(leaves)
-        if (check := _is_exact_field(leaf.field)) is not None
-    )
-    if not (has_integers or has_floats or checks):
-        return None
-
-    def is_in_range(message: Any, found: tuple[Any, ...]) -> bool:
-        try:
-            if has_integers:
-                pack_integers(*found[begin:between])
-            if has_floats and (rounded := unpack(pack(*found[between:end]))) != found[between:end]:
-                for put, value in zip(setters, rounded):  # noqa: B905, the check costs time
-                    put(message, value)
-        except (struct.error, OverflowError):
-            return False
-        for place, check in checks:  # noqa: SIM110, a generator takes thrice as long
-            if not check(found[place]):
-                return False
-        return True
-
-    return is_in_range
-
-
-def _setter(path: Path) -> Callable[[Any, Any], None]:
-    *holder, slot = path
-    if not holder:
-        return lambda message, value: setattr(message, slot, value)
-    get = attrgetter(".".join(holder))
-    return lambda message, value: setattr(get(message), slot, value)
-
-
-def _group(field: Field) -> int:
-    """0 for single integers, 1 for single ``float32``, 2 for the rest."""
-    if field.shape is not Shape.SINGLE:
-        return 2
-    return 0 if field.type.sort is Sort.INTEGER else 1 if field.type.code == "f" else 2
-
-
-def _kind_of(field: Field) -> type:
-    if field.shape is Shape.SINGLE:
-        return _KINDS[field.type.sort]
-    return {Shape.BUFFER: array, Shape.ARRAY: numpy.ndarray, Shape.LIST: list}[field.shape]
-
-
-def _is_exact_field(field: Field) -> IsExact | None:
-    """For values of the right class, ``None`` where all of them are right."""
+def _exact(field: Field) -> tuple[type, IsExact | None]:
+    """Class of the values that need no conversion; which of that class do not, ``None``: all."""
     of, bound = field.type, field.bound
+    if field.shape is Shape.SINGLE:
+        return _exact_single(of)
     if field.shape is Shape.BUFFER:
         code = of.code
-        if bound is None:
-            return lambda value: bool(value.typecode == code)
-        return lambda value: value.typecode == code and len(value) <= bound
+        return (
+            array,
+            lambda value: value.typecode == code and (bound is None or len(value) <= bound),
+        )
     if field.shape is Shape.ARRAY:
         dtype, shape = numpy.dtype(of.code), (field.size,)
-        return lambda value: (value.dtype is dtype or value.dtype == dtype) and value.shape == shape
-    if field.shape is Shape.LIST:
-        return _is_exact_list(field)
-    if of.sort in _TEXTS:
-        return _is_exact_text(of)
-    if of.sort is Sort.BYTE:
-        return lambda value: len(value) == 1
-    return _is_character if of.sort is Sort.CHARACTER else None
-
-
-def _is_exact_list(field: Field) -> IsExact:
-    of, size, bound = field.type, field.size, field.bound
-    is_message = of.sort is Sort.MESSAGE
-    kinds: tuple[set[type], ...] = ({of.message if is_message else _KINDS[of.sort]}, set())
-    are_exact = _exactness(of.message).of_all if is_message else _are_exact_values(of)
+        return (
+            numpy.ndarray,
+            lambda value: (value.dtype is dtype or value.dtype == dtype) and value.shape == shape,
+        )
+    item, is_exact_item = _exact_single(of)
+    classes: tuple[set[type], ...] = ({item}, set())
+    least, most = field.size or 0, field.size or bound or sys.maxsize
+    are_exact = _exactness(item).of_all if of.sort is Sort.MESSAGE else None
 
     def is_exact(values: list[Any]) -> bool:
-        if set(map(type, values)) not in kinds:
+        if set(map(type, values)) not in classes or not least <= len(values) <= most:
             return False
-        if size is not None and len(values) != size:
-            return False
-        if bound is not None and len(values) > bound:
-            return False
-        return are_exact is None or are_exact(values)
+        if are_exact is not None:
+            return are_exact(values)
+        if is_exact_item is _is_text:
+            return _is_text("".join(values))
+        return is_exact_item is None or all(map(is_exact_item, values))
 
-    return is_exact
-
-
-def _are_exact_values(of: Type) -> Callable[[list[Any]], bool] | None:
-    is_exact = _is_exact_field(Field("", of.name, of, Shape.SINGLE))
-    if is_exact is None:
-        return None
-    if of.sort in _TEXTS and of.bound is None:
-        return lambda texts: is_exact("".join(texts))
-    return lambda values: all(map(is_exact, values))
+    return list, is_exact
 
 
-def _is_exact_text(of: Type) -> IsExact:
+def _exact_single(of: Type) -> tuple[type, IsExact | None]:
+    """:func:`_exact` for a field, or an item, of a type."""
     bound = of.bound
-    if bound is None:
-        return lambda text: "\0" not in text and (text.isascii() or _is_unicode(text))
-    return lambda text: (
-        len(text) <= bound and "\0" not in text and (text.isascii() or _is_unicode(text))
-    )
+    if of.sort is Sort.MESSAGE:
+        return of.message, None
+    if of.sort in (Sort.TEXT, Sort.WIDE_TEXT):
+        if bound is None:
+            return str, _is_text
+        return str, lambda text: len(text) <= bound and _is_text(text)
+    return {
+        Sort.BOOL: (bool, None),
+        Sort.INTEGER: (int, _RANGES[of.code].__contains__ if of.code in _RANGES else None),
+        Sort.FLOAT: (float, None),
+        Sort.BYTE: (bytes, lambda value: len(value) == 1),
+        Sort.CHARACTER: (str, _is_character),
+    }[of.sort]
 
 
-def _is_unicode(text: str) -> bool:
+def _is_text(text: str) -> bool:
+    """Whether text arrives as it is: it does not with NUL, or halves of surrogate pairs."""
+    if "\0" in text:
+        return False
     try:
-        text.encode()
+        return text.isascii() or bool(text.encode())
     except UnicodeEncodeError:
         return False
-    return True
 
 
 def _is_character(value: str) -> bool:
@@ -272,93 +243,209 @@ def _is_character(value: str) -> bool:
 
 
 # ---------------------------------------------------------------------- converted, or refused
+#
+# Each function returns a value that a field can hold, the same one if there is nothing to convert,
+# or raises a Mismatch.
 
 
-@cache
-def _convert_message(kind: Any) -> Convert:
-    layout = schema(kind)
-    fields = tuple((field.slot, _convert_field(field)) for field in layout.fields)
-
-    def convert(message: Any) -> Any:
-        if type(message) is not kind:
-            if not isinstance(message, kind):
-                raise Mismatch(_describe(message), layout.name)
-            message = _of_very_class(message, kind)
-        for slot, convert_field in fields:
-            value = getattr(message, slot, _NOTHING)
-            try:
-                converted = convert_field(value)
-            except Mismatch as wrong:
-                raise wrong.within(slot[1:]) from None
-            if converted is not value:
-                setattr(message, slot, converted)
-        return message
-
-    return convert
-
-
-def _of_very_class(message: Any, kind: Any) -> Any:
-    """A message that is of a derived class, as one of the class itself."""
-    twin: Any = object.__new__(kind)
-    for slot in kind.__slots__:
-        if hasattr(message, slot):
-            setattr(twin, slot, getattr(message, slot))
-    return twin
-
-
-def _convert_field(field: Field) -> Convert:
+def converter(field: Field) -> Convert:
+    """The function that converts a value of a field. It raises :class:`Mismatch`."""
     if field.shape is Shape.SINGLE:
         return single_converter(field.type)
-    if field.shape is Shape.LIST:
-        return _convert_list(field)
-    return buffer_converter(field) if field.shape is Shape.BUFFER else _convert_array(field)
+    return partial(_SEVERAL[field.shape], field)
 
 
 def single_converter(of: Type) -> Convert:
+    """As :func:`converter`, for one value of a type."""
     if of.sort is Sort.MESSAGE:
-        return _convert_message(of.message)
-    if of.sort is Sort.INTEGER:
-        return _convert_integer(of)
-    if of.sort is Sort.FLOAT:
-        return _convert_float(of)
-    if of.sort in _TEXTS:
-        return _convert_text(of)
-    return {Sort.BOOL: _to_bool, Sort.BYTE: _to_byte, Sort.CHARACTER: _to_character}[of.sort]
+        return _message_converter(of.message)
+    return partial(_SINGLE[of.sort], of)
 
 
-def _convert_integer(of: Type) -> Convert:
-    allowed = _range_of(of)
-    text = f"{of.name}: {allowed[0]} to {allowed[-1]}"
-
-    def convert(value: Any) -> int:
-        number = value if type(value) is int else _number(value, text)
-        if type(number) is float:
-            if not number.is_integer():
-                raise Mismatch(_describe(value), f"{text} without a fraction")
-            number = int(number)
-        if number not in allowed:
-            raise Mismatch(_describe(value), text)
-        return int(number)
-
-    return convert
+@cache
+def _message_converter(kind: Any) -> Convert:
+    converters = [(field.slot, converter(field)) for field in schema(kind).fields]
+    return partial(_to_message, kind, converters)
 
 
-def _convert_float(of: Type) -> Convert:
-    is_single = of.code == "f"
-    largest = (2 - 2**-23) * 2.0**127 if is_single else sys.float_info.max  # IEEE 754
-    limits = f"{of.name}: {-largest:.8g} to {largest:.8g}"
-
-    def convert(value: Any) -> float:
-        number = value if type(value) is float else _number(value, of.name)
+def _to_message(kind: Any, converters: list[tuple[str, Convert]], message: Any) -> Any:
+    if type(message) is not kind:
+        if not isinstance(message, kind):
+            raise Mismatch(_describe(message), schema(kind).name)
+        derived, message = message, object.__new__(kind)
+        for slot in kind.__slots__:
+            if hasattr(derived, slot):
+                setattr(message, slot, getattr(derived, slot))
+    for slot, convert in converters:
+        value = getattr(message, slot, _NOTHING)
         try:
-            if not is_single:
-                return float(number)
-            rounded: float = _FLOAT.unpack(_FLOAT.pack(float(number)))[0]
-        except OverflowError:
-            raise Mismatch(_describe(value), limits) from None
-        return rounded
+            converted = convert(value)
+        except Mismatch as wrong:
+            raise wrong.within(slot[1:]) from None
+        if converted is not value:
+            setattr(message, slot, converted)
+    return message
 
-    return convert
+
+def _to_bool(of: Type, value: Any) -> bool:
+    allowed = "bool: True or False"
+    if type(value) is bool:
+        return value
+    if isinstance(value, numpy.bool_ | numpy.ndarray) and value.size == 1:
+        found = _as_array(value, allowed)
+        if found.dtype.kind == "b":
+            return bool(found.reshape(-1)[0])
+    raise Mismatch(_describe(value), allowed)
+
+
+def _to_integer(of: Type, value: Any) -> int:
+    allowed = _RANGES[of.code]
+    text = f"{of.name}: {allowed[0]} to {allowed[-1]}"
+    number = value if type(value) is int else _number(value, text)
+    if type(number) is float:
+        if not number.is_integer():
+            raise Mismatch(_describe(value), f"{text} without a fraction")
+        number = int(number)
+    if number not in allowed:
+        raise Mismatch(_describe(value), text)
+    return int(number)
+
+
+def _to_float(of: Type, value: Any) -> float:
+    is_single = of.code == "f"
+    if isinstance(value, float) and not is_single:  # numpy.float64 is one
+        return float(value)
+    try:
+        number = float(_number(value, of.name))
+        return _FLOAT.unpack(_FLOAT.pack(number))[0] if is_single else number
+    except OverflowError:
+        largest = (2 - 2**-23) * 2.0**127 if is_single else sys.float_info.max  # IEEE 754
+        allowed = f"{of.name}: {-largest:.8g} to {largest:.8g}"
+        raise Mismatch(_describe(value), allowed) from None
+
+
+def _to_byte(of: Type, value: Any) -> bytes:
+    if isinstance(value, bytes | bytearray | memoryview):
+        held = bytes(value)
+        if len(held) == 1:
+            return value if type(value) is bytes else held
+    raise Mismatch(_describe(value), "byte: bytes of length 1")
+
+
+def _to_character(of: Type, value: Any) -> str:
+    if isinstance(value, str) and _is_character(text := str.__str__(value)):
+        return text
+    raise Mismatch(_describe(value), "char: one character of ASCII")
+
+
+def _to_text(of: Type, value: Any) -> str:
+    if not isinstance(value, str):
+        raise Mismatch(_describe(value), of.name)
+    text = str.__str__(value)
+    if of.bound is not None and len(text) > of.bound:
+        allowed = f"{of.name}: at most {of.bound} characters"
+        raise Mismatch(f"{_REPR.repr(text)}: {len(text)} characters", allowed)
+    if not _is_text(text):
+        reason = "without NUL" if "\0" in text else "without halves of surrogate pairs"
+        raise Mismatch(_describe(value), f"{of.name} {reason}")
+    return text
+
+
+_SINGLE: dict[Sort, Callable[[Type, Any], Any]] = {
+    Sort.BOOL: _to_bool,
+    Sort.INTEGER: _to_integer,
+    Sort.FLOAT: _to_float,
+    Sort.BYTE: _to_byte,
+    Sort.CHARACTER: _to_character,
+    Sort.TEXT: _to_text,
+    Sort.WIDE_TEXT: _to_text,
+}
+
+
+def _to_buffer(field: Field, value: Any) -> array[Any]:
+    code = field.type.code
+    if type(value) is array and value.typecode == code:
+        _check_length(len(value), field)
+        return value
+    found = to_numbers(field, value)
+    if found.ndim != 1:
+        raise _no_list(value, field)
+    _check_length(len(found), field)
+    return array(code, found.tobytes())
+
+
+def _to_array(field: Field, value: Any) -> Any:
+    dtype = numpy.dtype(field.type.code)
+    if type(value) is numpy.ndarray and value.dtype == dtype and value.shape == (field.size,):
+        return value
+    found = to_numbers(field, value)
+    _check_length(found.size, field)
+    # A matrix goes row by row, as ROS documents covariances.
+    return numpy.array(found, dtype).reshape(-1)
+
+
+def _to_list(field: Field, value: Any) -> list[Any]:
+    items = _list_of(value, field)
+    _check_length(len(items), field)
+    converted = _convert_items(items, field.type)
+    is_same = items is value and all(map(is_, items, converted))
+    return items if is_same else converted
+
+
+_SEVERAL: dict[Shape, Callable[[Field, Any], Any]] = {
+    Shape.BUFFER: _to_buffer,
+    Shape.ARRAY: _to_array,
+    Shape.LIST: _to_list,
+}
+
+
+def to_numbers(field: Field, value: Any) -> Any:
+    """An array of NumPy of the field's type from many numbers, of any shape and length."""
+    of, dtype = field.type, numpy.dtype(field.type.code)
+    if isinstance(value, bytes | bytearray) and of.code == "B":
+        return numpy.frombuffer(value, dtype)
+    if isinstance(value, array | memoryview) or hasattr(type(value), "__array__"):
+        found = _as_array(value, field.name)
+        if found.dtype.kind in "biuf":
+            return _cast(found, of, dtype)
+        if found.ndim != 1:
+            raise _no_list(value, field)
+        value = list(found)
+    return numpy.array(_convert_items(_list_of(value, field), of), dtype)
+
+
+def _cast(found: Any, of: Type, dtype: Any) -> Any:
+    if found.dtype == dtype:
+        return found
+    with numpy.errstate(all="ignore"):
+        made = found.astype(dtype)
+        if of.sort is Sort.FLOAT:
+            is_wrong = numpy.isinf(made) & ~numpy.isinf(found)
+        else:
+            least, most = _RANGES[of.code][0], _RANGES[of.code][-1]
+            if found.dtype.kind == "f":
+                real = found.astype(float)
+                is_in_range = (real >= least) & (real < float(most + 1))
+                is_wrong = ~(is_in_range & (numpy.floor(real) == real))
+            else:
+                is_wrong = (found < least) | (found > most)
+    if is_wrong.any():
+        place = int(numpy.argmax(is_wrong.reshape(-1)))
+        try:
+            single_converter(of)(found.reshape(-1)[place])
+        except Mismatch as wrong:
+            raise wrong.within(f"[{place}]") from None
+    return made
+
+
+def _convert_items(items: Sequence[Any], of: Type) -> list[Any]:
+    convert, converted = single_converter(of), []
+    try:
+        for item in items:
+            converted.append(convert(item))
+    except Mismatch as wrong:
+        raise wrong.within(f"[{len(converted)}]") from None
+    return converted
 
 
 def _number(value: Any, allowed: str) -> int | float:
@@ -393,75 +480,6 @@ def _as_array(value: Any, allowed: str) -> Any:
     return found
 
 
-def _convert_text(of: Type) -> Convert:
-    is_exact = _is_exact_text(of)
-
-    def convert(value: Any) -> str:
-        if not isinstance(value, str):
-            raise Mismatch(_describe(value), of.name)
-        text = str.__str__(value)
-        if is_exact(text):
-            return text
-        if of.bound is not None and len(text) > of.bound:
-            allowed = f"{of.name}: at most {of.bound} characters"
-            raise Mismatch(f"{_REPR.repr(text)}: {len(text)} characters", allowed)
-        reason = "without NUL" if "\0" in text else "without halves of surrogate pairs"
-        raise Mismatch(_describe(value), f"{of.name} {reason}")
-
-    return convert
-
-
-def _to_bool(value: Any) -> bool:
-    if type(value) is bool:
-        return value
-    if isinstance(value, numpy.bool_ | numpy.ndarray) and value.size == 1:
-        found = _as_array(value, "bool: True or False")
-        if found.dtype.kind == "b":
-            return bool(found.reshape(-1)[0])
-    raise Mismatch(_describe(value), "bool: True or False")
-
-
-def _to_byte(value: Any) -> bytes:
-    if isinstance(value, bytes | bytearray | memoryview):
-        held = bytes(value)
-        if len(held) == 1:
-            return value if type(value) is bytes else held
-    raise Mismatch(_describe(value), "byte: bytes of length 1")
-
-
-def _to_character(value: Any) -> str:
-    if isinstance(value, str) and _is_character(text := str.__str__(value)):
-        return text
-    raise Mismatch(_describe(value), "char: one character of ASCII")
-
-
-def _convert_list(field: Field) -> Convert:
-    convert_item = single_converter(field.type)
-
-    def convert(value: Any) -> list[Any]:
-        items = _list_of(value, field)
-        _check_length(len(items), field)
-        converted = _convert_items(items, convert_item)
-        is_same = items is value and all(map(_is, items, converted))
-        return items if is_same else converted
-
-    return convert
-
-
-def _is(one: object, other: object) -> bool:
-    return one is other
-
-
-def _convert_items(items: Sequence[Any], convert_item: Convert) -> list[Any]:
-    converted: list[Any] = []
-    try:
-        for item in items:
-            converted.append(convert_item(item))
-    except Mismatch as wrong:
-        raise wrong.within(f"[{len(converted)}]") from None
-    return converted
-
-
 def _list_of(value: Any, field: Field) -> list[Any]:
     """The items of anything that has some, in an order."""
     if type(value) is list:
@@ -491,89 +509,6 @@ def _check_length(length: int, field: Field) -> None:
 
 def _items(number: int) -> str:
     return f"{number} item{'' if number == 1 else 's'}"
-
-
-def buffer_converter(field: Field) -> Convert:
-    code = field.type.code
-    to_numbers = numbers_converter(field)
-
-    def convert(value: Any) -> array[Any]:
-        if type(value) is array and value.typecode == code:
-            _check_length(len(value), field)
-            return value
-        found = to_numbers(value)
-        if found.ndim != 1:
-            raise _no_list(value, field)
-        _check_length(len(found), field)
-        return array(code, found.tobytes())
-
-    return convert
-
-
-def _convert_array(field: Field) -> Convert:
-    dtype, shape = numpy.dtype(field.type.code), (field.size,)
-    to_numbers = numbers_converter(field)
-
-    def convert(value: Any) -> Any:
-        if type(value) is numpy.ndarray and value.dtype == dtype and value.shape == shape:
-            return value
-        found = to_numbers(value)
-        _check_length(found.size, field)
-        # A matrix goes row by row, as ROS documents covariances.
-        return numpy.array(found, dtype).reshape(-1)
-
-    return convert
-
-
-def numbers_converter(field: Field) -> Convert:
-    """A function that makes an array of NumPy of the field's type from many numbers."""
-    of, dtype = field.type, numpy.dtype(field.type.code)
-    convert_item = single_converter(of)
-
-    def convert(value: Any) -> Any:
-        if isinstance(value, bytes | bytearray) and of.code == "B":
-            return numpy.frombuffer(value, dtype)
-        if isinstance(value, array | memoryview) or hasattr(type(value), "__array__"):
-            found = _as_array(value, field.name)
-            if found.dtype.kind in "biuf":
-                return _cast(found, of, dtype)
-            if found.ndim != 1:
-                raise _no_list(value, field)
-            value = list(found)
-        return numpy.array(_convert_items(_list_of(value, field), convert_item), dtype)
-
-    return convert
-
-
-def _cast(found: Any, of: Type, dtype: Any) -> Any:
-    if found.dtype == dtype:
-        return found
-    with numpy.errstate(all="ignore"):
-        if of.sort is Sort.FLOAT:
-            made = found.astype(dtype)
-            is_wrong = numpy.isinf(made) & ~numpy.isinf(found)
-        elif found.dtype.kind == "f":
-            allowed, real = _range_of(of), found.astype(float)
-            is_in_range = (real >= allowed[0]) & (real < float(allowed[-1] + 1))
-            is_wrong = ~(is_in_range & (numpy.floor(real) == real))
-            made = found.astype(dtype)
-        else:
-            allowed = _range_of(of)
-            is_wrong = (found < allowed[0]) | (found > allowed[-1])
-            made = found.astype(dtype)
-    if is_wrong.any():
-        place = int(numpy.argmax(is_wrong.reshape(-1)))
-        try:
-            single_converter(of)(found.reshape(-1)[place])
-        except Mismatch as wrong:
-            raise wrong.within(f"[{place}]") from None
-    return made
-
-
-def _range_of(of: Type) -> range:
-    bits = 8 * struct.calcsize(of.code)
-    is_signed = of.code.islower()
-    return range(-(2 ** (bits - 1)), 2 ** (bits - 1)) if is_signed else range(2**bits)
 
 
 def _describe(value: Any) -> str:
