@@ -1,10 +1,10 @@
 """The two executors of rclpy that can serve a :class:`~neuros.transport.ros_loop.RosLoop`.
 
-``events`` is rclpy's ``EventsExecutor``, one queue in C++, and the default: ``rclpy.spin`` with its
-``SingleThreadedExecutor`` builds a new wait set for every callback and takes twice to three times
-as long for a round trip. But it is in rclpy's *experimental* package. Should a release move or
-change it, the loop falls back to ``wait_set``, on the public parts of the old executor: slower,
-with an equal order of events. The environment variable ``NEUROS_EXECUTOR`` asks for one of the two.
+``events``, the default, is rclpy's ``EventsExecutor``, one queue in C++. It is in rclpy's
+*experimental* package: should a release move or change it, the loop falls back to ``wait_set``, on
+the public parts of ``SingleThreadedExecutor``. That one builds a new wait set for every callback: a
+round trip takes two to three times as long, in an equal order of events. The environment variable
+``NEUROS_EXECUTOR`` chooses.
 """
 
 from __future__ import annotations
@@ -68,24 +68,19 @@ def make_executor(context: Context, on_failure: OnFailure) -> Executor:
     if wanted == "wait_set":
         return WaitSetExecutor(context)
     try:
-        return _events_executor(context, on_failure)
+        from rclpy.experimental.events_executor import EventsExecutor  # may have gone
+
+        with own_tasks(on_failure):
+            executor: Executor = EventsExecutor(context=context)
+        for name in ("add_node", "create_task", "spin_until_future_complete", "shutdown"):
+            getattr(executor, name)
+        return executor
     except (ImportError, AttributeError, TypeError, RuntimeError) as error:
         get_logger("neuros").warning(
             f"rclpy's EventsExecutor cannot be used here ({error}): falling back to a wait set,"
             " with which packets take longer"
         )
         return WaitSetExecutor(context)
-
-
-def _events_executor(context: Context, on_failure: OnFailure) -> Executor:
-    from rclpy.experimental.events_executor import EventsExecutor  # may have gone
-
-    with own_tasks(on_failure):
-        executor = EventsExecutor(context=context)
-    for name in ("add_node", "create_task", "spin_until_future_complete", "shutdown"):
-        getattr(executor, name)
-    found: Executor = executor
-    return found
 
 
 class WaitSetExecutor:
@@ -95,6 +90,9 @@ class WaitSetExecutor:
         self._ros = SingleThreadedExecutor(context=context)
         self._tasks: deque[Callable[[], None]] = deque()
         self._is_woken = False
+        # Attributes: given another condition, rclpy begins anew, without coroutines that wait.
+        self._has_other_work = lambda: self._is_woken or bool(self._tasks)
+        self._has_no_other_work = lambda: False
 
     def add_node(self, node: RosNode) -> None:
         """Serve what is on a ROS node."""
@@ -132,8 +130,14 @@ class WaitSetExecutor:
         self._ros.wake()
 
     def _run_what_ros_has(self) -> None:
-        """Until nothing waits; tasks get their turn also while more keeps coming."""
-        left, has_run = self._most_that_waits(), True
+        """Run what waits in ROS, and no more, so that tasks get their turn."""
+        most_that_waits = sum(
+            sum(each.qos_profile.depth or _SERVICE_DEPTH for each in node.subscriptions)
+            + len([*node.timers])
+            + _SERVICE_DEPTH * sum(len([*e]) for e in (node.services, node.clients, node.waitables))
+            for node in self._ros.get_nodes()
+        )
+        left, has_run = most_that_waits, True
         while not self._is_woken and left > 0:
             had_run, has_run = has_run, self._run_one_of_ros(0.0)
             # A wait that a callback ended says "timeout" once, even if more has come meanwhile.
@@ -141,18 +145,8 @@ class WaitSetExecutor:
                 return
             left -= has_run
 
-    def _most_that_waits(self) -> int:
-        """The most callbacks that can wait at one moment."""
-        return sum(
-            sum(each.qos_profile.depth or _SERVICE_DEPTH for each in node.subscriptions)
-            + len([*node.timers])
-            + _SERVICE_DEPTH * sum(len([*e]) for e in (node.services, node.clients, node.waitables))
-            for node in self._ros.get_nodes()
-        )
-
     def _run_one_of_ros(self, wait_s: float) -> bool:
         """Run one callback; returns False if there was none, or a task or a waker came first."""
-        # rclpy begins anew, without coroutines that wait, unless it gets equal conditions.
         condition = self._has_other_work if wait_s else self._has_no_other_work
         try:
             task, _, _ = self._ros.wait_for_ready_callbacks(timeout_sec=wait_s, condition=condition)
@@ -162,10 +156,3 @@ class WaitSetExecutor:
         if task.exception() is not None:
             raise task.exception()
         return True
-
-    def _has_other_work(self) -> bool:
-        return self._is_woken or bool(self._tasks)
-
-    def _has_no_other_work(self) -> bool:
-        """Never: without waiting, what ROS has comes first."""
-        return False

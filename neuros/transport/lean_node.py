@@ -1,11 +1,10 @@
 """The lean ROS node of a NeuROS node, and the callbacks that a plugin registers there.
 
-It is rclpy's own, served by NeuROS and by no other executor. A hook that waits for a callback would
-wait for what comes after the hook: an error says so.
+The node is rclpy's own, served by NeuROS's executor alone. Callbacks run between hooks, so a hook
+that waits for a callback would wait for ever: it gets an error instead.
 
-It has services for parameters only where it has some. rclpy gives each node six of them: twelve of
-some twenty endpoints, which every process of a domain hears of from every other, and more than half
-of what has to be found before the first packet.
+The node has services for parameters only if it has parameters. rclpy gives each node six of them:
+twelve of some twenty endpoints that every process of a domain has to find before the first packet.
 """
 
 from __future__ import annotations
@@ -40,9 +39,6 @@ _OF_ROS = "use_sim_time"  # rclpy declares it itself
 
 Fail: TypeAlias = Callable[[Any, BaseException], None]
 
-# Methods that take a callback, and its place among their arguments.
-_CREATORS = (("create_timer", 1), ("create_service", 2))
-
 
 class LeanNode(RosNode):  # type: ignore[misc]
     """Offers its parameters to others as soon as there is one besides those of ROS.
@@ -51,7 +47,12 @@ class LeanNode(RosNode):  # type: ignore[misc]
         names: namespace and remapping rules, which hold for all that is created on it.
         parameters: declared from the start. A plugin may declare them once more, with a description
             for instance, and gets the value that is given here.
+
+    Attributes:
+        callbacks: guards what a plugin creates on the node; ``None`` before the plugin has it.
     """
+
+    callbacks: PluginCallbacks | None = None
 
     def __init__(
         self,
@@ -61,7 +62,6 @@ class LeanNode(RosNode):  # type: ignore[misc]
         parameters: Mapping[str, Value] = _NOTHING,
     ) -> None:
         self._is_complete = False
-        self._wrap: Callable[[Any], Any] | None = None
         self._declared_for_project = {*parameters} - {_OF_ROS}
         self._parameter_service: ParameterService | None = None
         super().__init__(
@@ -96,7 +96,9 @@ class LeanNode(RosNode):  # type: ignore[misc]
     def executor(self) -> Any:
         """The executor of the node; tasks that a plugin creates there are part of the node."""
         found = super().executor
-        return found if found is None or self._wrap is None else _Tasks(found, self._wrap)
+        if found is None or self.callbacks is None:
+            return found
+        return _Tasks(found, self.callbacks.wrapped)
 
     @executor.setter
     def executor(self, executor: Any) -> None:
@@ -106,9 +108,66 @@ class LeanNode(RosNode):  # type: ignore[misc]
             raise _not_for_plugins(f"rclpy.spin or {type(executor).__name__}.add_node")
         RosNode.executor.fset(self, executor)
 
-    def wrap_tasks(self, wrap: Callable[[Any], Any]) -> None:
-        """Wrap all callbacks that run as tasks from now on."""
-        self._wrap = wrap
+    def create_timer(
+        self, timer_period_sec: float, callback: Any, *rest: Any, **keywords: Any
+    ) -> Any:
+        """As in rclpy."""
+        return super().create_timer(timer_period_sec, self._new(callback), *rest, **keywords)
+
+    def create_service(self, srv_type: Any, srv_name: str, callback: Any, **keywords: Any) -> Any:
+        """As in rclpy; a service does not answer after a failure of its node."""
+        callbacks = self.callbacks
+        if callbacks is None:
+            return super().create_service(srv_type, srv_name, callback, **keywords)
+        if callbacks.loop.is_limited and inspect.iscoroutinefunction(callback):
+            raise NodeError(_not_served("create_service", "a coroutine as its callback"))
+        service = super().create_service(srv_type, srv_name, self._new(callback), **keywords)
+        send_response = service.send_response
+
+        def answer(*arguments: Any) -> None:
+            if not callbacks.is_closed:
+                send_response(*arguments)
+
+        service.send_response = answer
+        return service
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **keywords: Any
+    ) -> Subscription:
+        """As in rclpy."""
+        guarded = self._new(callback)
+        if guarded is not callback and not inspect.iscoroutinefunction(callback):
+            depth = qos_profile if isinstance(qos_profile, int) else qos_profile.depth
+            assert self.callbacks is not None
+            guarded = _rationed(guarded, self.callbacks.loop, depth)
+        return super().create_subscription(msg_type, topic, guarded, qos_profile, **keywords)
+
+    def create_client(self, *arguments: Any, **keywords: Any) -> Any:
+        """As in rclpy; a call that waits is an error in the thread of hooks."""
+        if self.callbacks is None:
+            return super().create_client(*arguments, **keywords)
+        self.callbacks.loop.expect_arrivals()
+        client = super().create_client(*arguments, **keywords)
+        self.callbacks.guard_client(client)
+        return client
+
+    def create_guard_condition(self, *arguments: Any, **keywords: Any) -> Any:
+        """As in rclpy, unless the executor does not serve them."""
+        if self.callbacks is not None and self.callbacks.loop.is_limited:
+            raise NodeError(_not_served("create_guard_condition", "guard conditions"))
+        return super().create_guard_condition(*arguments, **keywords)
+
+    def add_waitable(self, waitable: Any) -> None:
+        """As in rclpy: for the server or client of an action, or events of DDS."""
+        waitable.execute = self._new(waitable.execute)
+        super().add_waitable(waitable)
+
+    def _new(self, callback: Any) -> Any:
+        """The callback of something that is being created, guarded if a plugin creates it."""
+        if self.callbacks is None:
+            return callback
+        self.callbacks.loop.expect_arrivals()
+        return self.callbacks.wrapped(callback)
 
 
 class _Tasks:
@@ -133,9 +192,9 @@ def lean_node(file: NodeFile, context: Context) -> LeanNode:
 
 
 class PluginCallbacks:
-    """Wraps the callbacks of all that a plugin creates on its ROS node from now on.
+    """Guards the callbacks of all that a plugin creates on its ROS node from now on.
 
-    What they raise must not reach the executor of rclpy. It prints a traceback of its own, and
+    What they raise must not reach the executor of rclpy: it prints a traceback of its own, and
     where a task has failed (a coroutine, a callback of a future) it ends the process by SIGSEGV.
 
     Args:
@@ -147,149 +206,68 @@ class PluginCallbacks:
     def __init__(
         self, ros_node: LeanNode, loop: RosLoop, enter: Callable[[], None], fail: Fail
     ) -> None:
-        self._loop = loop
+        self.loop = loop
+        self.is_closed = False
         self._enter = enter
         self._fail = fail
-        self._is_over = False
         self._thread = threading.get_ident()  # in which the loop runs hooks and callbacks
-        for name, place in _CREATORS:
-            setattr(ros_node, name, self._creating(getattr(ros_node, name), name, place))
-        ros_node.create_subscription = self._subscribing(ros_node.create_subscription)
-        ros_node.create_client = self._creating_client(ros_node.create_client)
-        ros_node.add_waitable = self._adding(ros_node.add_waitable)
-        if loop.is_limited:
-            ros_node.create_guard_condition = _refuse_guard_condition
-        ros_node.wrap_tasks(self.wrapped)
+        ros_node.callbacks = self
 
     def close(self) -> None:
         """Call none of them any more: the node has ended."""
-        self._is_over = True
+        self.is_closed = True
 
     def wrapped(self, callback: Any) -> Any:
         """``callback`` as a part of its node. It returns its last argument where it has failed."""
         if not callable(callback):
             return callback
         if inspect.iscoroutinefunction(callback):
-            return self._wrapped_coroutine(callback)
+
+            @functools.wraps(callback)
+            async def entering_steps(*arguments: Any, **keywords: Any) -> Any:
+                if not self.is_closed:
+                    try:
+                        steps = callback(*arguments, **keywords)
+                        return await _EnteringSteps(steps, self._enter, self.loop.note_execution)
+                    except BaseException as error:
+                        self._give_up(callback, error)
+                return arguments[-1] if arguments else None
+
+            return entering_steps
 
         @functools.wraps(callback)  # rclpy asks for its signature
         def entering(*arguments: Any, **keywords: Any) -> Any:
-            if not self._is_over:
+            if not self.is_closed:
                 self._enter()
                 try:
                     return callback(*arguments, **keywords)
                 except BaseException as error:
                     self._give_up(callback, error)
                 finally:
-                    self._loop.note_execution()
+                    self.loop.note_execution()
             return arguments[-1] if arguments else None
 
         return entering
 
-    # ------------------------------------------------------------------ what creates something
+    def guard_client(self, client: Any) -> None:
+        """Guard callbacks of a client's futures; refuse calls that wait in the loop's thread."""
+        call, call_async = client.call, client.call_async
 
-    def _creating(self, create: Callable[..., Any], name: str, place: int) -> Any:
-        is_service = name == "create_service"
+        def guarded_call(*arguments: Any, **keywords: Any) -> Any:
+            if threading.get_ident() == self._thread:
+                raise _not_for_plugins("client.call")
+            return call(*arguments, **keywords)
 
-        @functools.wraps(create)
-        def creating(*arguments: Any, **keywords: Any) -> Any:
-            if len(arguments) > place:
-                callback = arguments[place]
-                arguments = (*arguments[:place], self.wrapped(callback), *arguments[place + 1 :])
-            else:
-                callback = keywords.get("callback")
-                keywords["callback"] = self.wrapped(callback)
-            if is_service and self._loop.is_limited and inspect.iscoroutinefunction(callback):
-                raise NodeError(_not_served(name, "a coroutine as its callback"))
-            self._loop.expect_arrivals()
-            made = create(*arguments, **keywords)
-            if is_service:
-                made.send_response = self._answering(made.send_response)
-            return made
-
-        return creating
-
-    def _subscribing(self, create: Callable[..., Subscription]) -> Any:
-        @functools.wraps(create)
-        def subscribing(
-            msg_type: Any, topic: str, callback: Any, qos_profile: Any, *rest: Any, **keywords: Any
-        ) -> Subscription:
-            self._loop.expect_arrivals()
-            wrapped = self.wrapped(callback)
-            if callable(callback) and not inspect.iscoroutinefunction(callback):
-                depth = qos_profile if isinstance(qos_profile, int) else qos_profile.depth
-                wrapped = _rationed(wrapped, self._loop, depth)
-            return create(msg_type, topic, wrapped, qos_profile, *rest, **keywords)
-
-        return subscribing
-
-    def _answering(self, send_response: Callable[..., None]) -> Any:
-        """A service does not answer after a failure."""
-
-        def answering(*arguments: Any) -> None:
-            if not self._is_over:
-                send_response(*arguments)
-
-        return answering
-
-    def _creating_client(self, create: Callable[..., Any]) -> Any:
-        @functools.wraps(create)
-        def creating(*arguments: Any, **keywords: Any) -> Any:
-            self._loop.expect_arrivals()
-            client = create(*arguments, **keywords)
-            client.call_async = self._calling(client.call_async)
-            client.call = self._calling_and_waiting(client.call)
-            return client
-
-        return creating
-
-    def _calling(self, call_async: Callable[[Any], Any]) -> Any:
-        @functools.wraps(call_async)
-        def calling(request: Any) -> Any:
+        def guarded_call_async(request: Any) -> Any:
             future = call_async(request)
             add = future.add_done_callback
             future.add_done_callback = lambda callback: add(self.wrapped(callback))
             return future
 
-        return calling
-
-    def _calling_and_waiting(self, call: Callable[..., Any]) -> Any:
-        @functools.wraps(call)
-        def calling(*arguments: Any, **keywords: Any) -> Any:
-            if threading.get_ident() == self._thread:
-                raise _not_for_plugins("client.call")
-            return call(*arguments, **keywords)
-
-        return calling
-
-    def _adding(self, add_waitable: Callable[[Any], None]) -> Any:
-        """The server or client of an action, or events of DDS."""
-
-        @functools.wraps(add_waitable)
-        def adding(waitable: Any) -> None:
-            self._loop.expect_arrivals()
-            waitable.execute = self.wrapped(waitable.execute)
-            add_waitable(waitable)
-
-        return adding
-
-    # ------------------------------------------------------------------ inside
-
-    def _wrapped_coroutine(self, callback: Callable[..., Coroutine[Any, Any, Any]]) -> Any:
-        @functools.wraps(callback)
-        async def entering(*arguments: Any, **keywords: Any) -> Any:
-            if not self._is_over:
-                try:
-                    steps = callback(*arguments, **keywords)
-                    return await _EnteringSteps(steps, self._enter, self._loop.note_execution)
-                except BaseException as error:
-                    self._give_up(callback, error)
-            return arguments[-1] if arguments else None
-
-        return entering
+        client.call, client.call_async = guarded_call, guarded_call_async
 
     def _give_up(self, callback: Any, error: BaseException) -> None:
-        self._is_over = True
+        self.is_closed = True
         self._fail(callback, error)
 
 
@@ -329,10 +307,10 @@ class _EnteringSteps(Generator[Any, Any, Any]):
 def _rationed(callback: Callable[..., Any], loop: RosLoop, depth: int) -> Callable[..., Any]:
     """A callback of a subscription, called for at most ``depth`` messages in one turn of the loop.
 
-    rclpy queues an event for each message, and each event takes the newest there is. So with a
-    callback that takes longer than there is between two messages, twice as many would come before
-    each hook as before the last one. What comes beyond ``depth`` waits for the next turn, and takes
-    the place of what is older, as it would in DDS. A depth of 0 (KEEP_ALL) drops nothing.
+    rclpy queues an event for each message. With a callback that takes longer than the time between
+    two messages, the messages before each hook would double from one hook to the next. Messages
+    beyond ``depth`` wait for the next turn and replace older ones, as in DDS. A depth of 0
+    (KEEP_ALL) drops nothing.
     """
     waiting: deque[tuple[Any, ...]] = deque(maxlen=depth or None)
     turn, left = -1, 0
@@ -360,10 +338,6 @@ def _rationed(callback: Callable[..., Any], loop: RosLoop, depth: int) -> Callab
         waiting.append(message)
 
     return receive
-
-
-def _refuse_guard_condition(*_: Any, **__: Any) -> Any:
-    raise NodeError(_not_served("create_guard_condition", "guard conditions"))
 
 
 def _not_served(name: str, what: str) -> str:

@@ -153,7 +153,8 @@ class SegmentWriter:
         lengths = tuple(len(buffer) * buffer.itemsize for buffer in buffers)
         mapping = self._with_room_for(_span(lengths))
         self._generation += 1
-        self._let_go_of_former()
+        while self._former and self._former[0][0] < self._generation:
+            self._remove(self._former.pop(0)[1])
         slot = self._generation % self._slots
         start = slot * mapping.slot_bytes
         mapping.generations[start // 8] = 0
@@ -184,10 +185,6 @@ class SegmentWriter:
             self._former.append((self._generation + self._slots, current))
         self._current = created
         return created
-
-    def _let_go_of_former(self) -> None:
-        while self._former and self._former[0][0] < self._generation:
-            self._remove(self._former.pop(0)[1])
 
     def _remove(self, mapping: _Mapping) -> None:
         mapping.release()

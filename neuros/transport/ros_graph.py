@@ -36,17 +36,17 @@ from neuros.transport.codecs import WrongBytes, message_codec
 from neuros.transport.messages import message_class
 from neuros.transport.ros_loop import RosLoop
 
-_QOS_LOOK_S = 0.3
+_QOS_POLL_S = 0.3
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
-_MOST_QOS_LOOKS = 20
+_MOST_QOS_POLLS = 20
 """The graph lists an endpoint a moment after DDS reports it, or seconds later under load."""
 
 _ADVICE = 'give both the same, with "qos" in the project'
 
-_SILENCE_LOOK_S = 5.0
+_SILENCE_S = 5.0
 """By then, programs that are there have been found."""
 
-_LISTENERS_LOOK_S = 0.25
+_SUBSCRIPTIONS_POLL_S = 0.25
 
 
 class ExternalTopics:
@@ -64,15 +64,22 @@ class ExternalTopics:
         self._is_open = True
         for port in self._file.node.outputs:
             if port.external_topic is not None:
-                self._publishers[port.name] = self._publisher(port, port.external_topic)
-        heard = {
+                profile = qos_profile(port.qos or OFFERED)
+                check = self._qos_check(port, port.external_topic, profile, is_input=False)
+                self._publishers[port.name] = self._ros_node.create_publisher(
+                    message_class(port.type),
+                    port.external_topic,
+                    profile,
+                    event_callbacks=PublisherEventCallbacks(incompatible_qos=check),
+                )
+        subscriptions = {
             port: self._subscription(port, port.external_topic, inbox)
             for port in self._file.node.inputs
             if port.external_topic is not None and not port.external_topic.startswith(SESSION)
         }
-        if heard:
+        if subscriptions:
             self._loop.expect_arrivals()
-            _check_silence(self._ros_node, heard, self._loop)
+            _check_silence(self._ros_node, subscriptions, self._loop)
 
     def send(self, port: Port, packet: Any) -> None:
         if self._is_open:
@@ -82,50 +89,35 @@ class ExternalTopics:
         """Publish and receive nothing any more; the endpoints go with their ROS node."""
         self._is_open = False
 
-    def _publisher(self, port: Port, topic: str) -> Publisher:
-        profile = qos_profile(port.qos or OFFERED)
-        check = self._qos_check(port, topic, profile, is_input=False)
-        return self._ros_node.create_publisher(
-            message_class(port.type),
-            topic,
-            profile,
-            event_callbacks=PublisherEventCallbacks(incompatible_qos=check),
-        )
-
     def _subscription(self, port: Port, topic: str, inbox: Inbox) -> Subscription:
         kind = message_class(port.type)
         profile = qos_profile(port.qos or ASKED)
-        deliver = partial(inbox.on_external_packet, port)
-        check = self._qos_check(port, topic, profile, is_input=True)
-        return self._ros_node.create_subscription(
-            kind,
-            topic,
-            self._loop.guarded(self._receiver(kind, topic, deliver)),
-            profile,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=check),
-            raw=True,
-        )
-
-    def _receiver(
-        self, kind: type, topic: str, deliver: Callable[[Any], None]
-    ) -> Callable[[bytes], None]:
         decode = message_codec(kind).decode
-        warned: list[str] = []
+        has_warned = False
 
         def receive(data: bytes) -> None:
+            nonlocal has_warned
             if not self._is_open:
                 return
             try:
                 packet = decode(data)
             except WrongBytes as error:  # anybody may publish there
-                if not warned:
-                    warned.append(str(error))
+                if not has_warned:
+                    has_warned = True
                     text = f"{topic}: a packet is left out, and others like it: {error}"
                     self._ros_node.get_logger().warning(text)
             else:
-                deliver(packet)
+                inbox.on_external_packet(port, packet)
 
-        return receive
+        check = self._qos_check(port, topic, profile, is_input=True)
+        return self._ros_node.create_subscription(
+            kind,
+            topic,
+            self._loop.guarded(receive),
+            profile,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=check),
+            raw=True,
+        )
 
     def _qos_check(self, port: Port, topic: str, own: QoSProfile, *, is_input: bool) -> QosCheck:
         full = self._file.names.resolve(topic, self._file.node.name)
@@ -160,7 +152,7 @@ class RosGraphBridge:
                     data_qos(connection),
                 )
         if self._publishers:
-            self._loop.every(self._ros_node, _LISTENERS_LOOK_S, self._look)
+            self._loop.every(self._ros_node, _SUBSCRIPTIONS_POLL_S, self._count_subscriptions)
 
     def show(self, connections: Sequence[Connection], packet: Any) -> None:
         """Publish a packet on data topics that have subscriptions."""
@@ -175,7 +167,7 @@ class RosGraphBridge:
         self.heard = frozenset()
         self._external.close()
 
-    def _look(self) -> None:
+    def _count_subscriptions(self) -> None:
         self.heard = frozenset(
             connection
             for connection, publisher in self._publishers.items()
@@ -247,13 +239,13 @@ class QosCheck:
     def __call__(self, event: Any) -> None:
         """DDS has found an endpoint that does not fit: look for it in the ROS graph."""
         policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
-        total, looks = event.total_count, 0
+        total, polls = event.total_count, 0
 
-        def look() -> None:
-            nonlocal looks
-            looks += 1
-            is_last = looks == _MOST_QOS_LOOKS
-            self._look(is_last=is_last)
+        def poll() -> None:
+            nonlocal polls
+            polls += 1
+            is_last = polls == _MOST_QOS_POLLS
+            self._check_graph(is_last=is_last)
             if len(self._named) >= total or is_last:
                 self._ros_node.destroy_timer(timer)
                 if not self._named:
@@ -262,9 +254,9 @@ class QosCheck:
                         f" {policy} does not fit"
                     )
 
-        timer = self._loop.every(self._ros_node, _QOS_LOOK_S, look)
+        timer = self._loop.every(self._ros_node, _QOS_POLL_S, poll)
 
-    def _look(self, *, is_last: bool) -> None:
+    def _check_graph(self, *, is_last: bool) -> None:
         topic = self._port.external_topic  # by the name that rules apply to
         if self._is_input:
             others = self._ros_node.get_publishers_info_by_topic(topic)
@@ -328,28 +320,28 @@ class StrangerCheck:
         def on_matched(event: Any) -> None:
             if event.current_count <= len(writers):
                 return
-            looks = 0
+            polls = 0
 
-            def look(*, is_last: bool = False) -> None:
-                nonlocal looks
-                looks += 1
+            def poll(*, is_last: bool = False) -> None:
+                nonlocal polls
+                polls += 1
                 listed = self._ros_node.get_publishers_info_by_topic(topic)
                 names = Counter(each.node_name for each in listed) - Counter(writers)
-                if _UNKNOWN_NODE not in names or looks == _MOST_QOS_LOOKS or is_last:
+                if _UNKNOWN_NODE not in names or polls == _MOST_QOS_POLLS or is_last:
                     self._ros_node.destroy_timer(timer)
                     self._pending.remove(at_end)
                     self._name(connection, topic, names)
 
-            at_end = partial(look, is_last=True)
+            at_end = partial(poll, is_last=True)
             self._pending.append(at_end)
-            timer = self._loop.every(self._ros_node, _QOS_LOOK_S, look)
+            timer = self._loop.every(self._ros_node, _QOS_POLL_S, poll)
 
         return SubscriptionEventCallbacks(matched=on_matched)
 
     def close(self) -> None:
         """Name those of whom the ROS graph does not know the node yet, too."""
-        for look in tuple(self._pending):
-            look()
+        for poll in tuple(self._pending):
+            poll()
 
     def _name(self, connection: Connection, topic: str, names: Iterable[str]) -> None:
         new = sorted({(topic, name) for name in names} - self._named)
@@ -365,25 +357,27 @@ class StrangerCheck:
             )
 
 
-def _check_silence(ros_node: RosNode, heard: Mapping[Port, Subscription], loop: RosLoop) -> None:
+def _check_silence(
+    ros_node: RosNode, subscriptions: Mapping[Port, Subscription], loop: RosLoop
+) -> None:
     """Warn in the node's log of external inputs without a publisher, 5 s from now.
 
     Those whose QoS does not fit are left to :class:`QosCheck`.
 
     Args:
-        heard: the inputs with an external topic, and their subscriptions.
+        subscriptions: by inputs with an external topic.
     """
 
-    def look() -> None:
+    def poll() -> None:
         ros_node.destroy_timer(timer)
-        for port, subscription in heard.items():
+        for port, subscription in subscriptions.items():
             if subscription.get_publisher_count():
                 continue
             reason = _reason(ros_node, port, subscription)
             if reason:
                 ros_node.get_logger().warning(f"input '{port.name}': {reason}")
 
-    timer = loop.every(ros_node, _SILENCE_LOOK_S, look)
+    timer = loop.every(ros_node, _SILENCE_S, poll)
 
 
 def _reason(ros_node: RosNode, port: Port, subscription: Subscription) -> str:

@@ -59,9 +59,11 @@ _CROWD = 16
 class RosProcess:
     """The :class:`neuros.ports.Middleware` of one node, or (``in_memory``) of all of a project.
 
-    ``digests``: in memory, too, where a packet is serialised only for that; where all connections
-    are lossless they are kept unasked, if that is cheap. ``record``: at least those that tell which
-    packets have arrived where some may be lost; the packets themselves are in the bag.
+    Args:
+        digests: whether digests are kept in memory, too, where a packet is serialised only for
+            its digest. Without losses they are kept anyway, if they are cheap.
+        record: whether packets go to a bag. Digests then only tell which packets have arrived, on
+            connections that may lose some.
     """
 
     def __init__(
@@ -80,7 +82,9 @@ class RosProcess:
         # rcl would write each record to a second log file, which costs as much as a packet.
         arguments = ["--ros-args", "--disable-external-lib-logs"]
         for file in files if debug else ():
-            arguments += ["--log-level", f"{_logger_name(file)}:=debug"]
+            # rcl makes the logger's name from namespace and name.
+            logger = f"{file.names.namespace}/{file.node.name}"[1:].replace("/", ".")
+            arguments += ["--log-level", f"{logger}:=debug"]
         rclpy.init(
             args=arguments,
             context=self._context,
@@ -152,27 +156,19 @@ class RosProcess:
         self.loop.run_for(_LINGER_S)
 
     def close(self) -> None:
-        """Give up everything; in a crowd ROS goes with the process.
+        """Close the loop and ROS. In a crowd, ROS stays open until the process ends.
 
-        Others in that crowd notice after 20 s that a process has gone, as with one that was
+        Other processes of a crowd then notice after 20 s that this one has gone, as if it had been
         killed; the shared memory of DDS is left to the reaper.
         """
         self.loop.close()
-        if self._is_in_a_crowd():
+        others: set[str] = set()
+        for ros_node in [*self._ros_nodes.values()][:1]:  # each lists the whole domain
+            others = {*ros_node.get_node_names()} - {*self._ros_nodes}
+        if len(others) > _CROWD:
             keep_to_the_end(self._ros_nodes.values())
         else:
             give_up(self._context, self._ros_nodes.values())
-
-    def _is_in_a_crowd(self) -> bool:
-        """Whether many nodes of other processes are in the domain."""
-        for ros_node in self._ros_nodes.values():
-            return len({*ros_node.get_node_names()} - {*self._ros_nodes}) > _CROWD
-        return False
-
-
-def _logger_name(file: NodeFile) -> str:
-    """As rcl makes it from namespace and name."""
-    return f"{file.names.namespace}/{file.node.name}"[1:].replace("/", ".")
 
 
 def _entities(ros_node: RosNode) -> set[int]:
@@ -186,7 +182,9 @@ def _entities(ros_node: RosNode) -> set[int]:
 
 
 class PeerVoice:
-    """Speaks for nodes of this process, and listens to nodes elsewhere, in a thread of its own.
+    """Publishes the state of this launcher for its nodes, and receives that of nodes elsewhere.
+
+    It has a thread of its own.
 
     The nodes of a launcher publish its state (:class:`neuros.launcher.peers.PeerState`), each on a
     topic of its own, ``/neuros/<node>/peer_state`` in the project's namespace: a latched
@@ -226,10 +224,10 @@ class PeerVoice:
             self._ros_node.create_subscription(
                 String,
                 _topic(namespace, name),
-                partial(self._hear, name),
+                partial(self._receive, name),
                 _qos(LEASE_S),
                 event_callbacks=SubscriptionEventCallbacks(
-                    liveliness=partial(self._count, name), use_default_callbacks=False
+                    liveliness=partial(self._on_liveliness, name), use_default_callbacks=False
                 ),
             )
         self._executor = SingleThreadedExecutor(context=context)
@@ -238,12 +236,12 @@ class PeerVoice:
         self._thread.start()
 
     def say(self, text: str) -> None:
-        """Let it be heard elsewhere, also by who comes later. Any thread."""
+        """Publish a state, also for launchers that come later. Any thread."""
         for publisher in self._publishers:
             publisher.publish(String(data=text))
 
     def close(self) -> None:
-        """Let the last state arrive, then be silent."""
+        """Let the last state arrive, then destroy the ROS node."""
         for publisher in self._publishers:
             publisher.wait_for_all_acked(Duration(seconds=_HEARD_S))
         self._executor.shutdown(_HEARD_S)
@@ -254,10 +252,10 @@ class PeerVoice:
         with contextlib.suppress(ExternalShutdownException):  # the process has given up ROS
             self._executor.spin()
 
-    def _hear(self, name: str, message: String) -> None:
+    def _receive(self, name: str, message: String) -> None:
         self._heard(name, message.data)
 
-    def _count(self, name: str, life: QoSLivelinessChangedInfo) -> None:
+    def _on_liveliness(self, name: str, life: QoSLivelinessChangedInfo) -> None:
         if life.alive_count_change < 0 or life.not_alive_count_change > 0:
             self._heard(name, None)
 
