@@ -67,7 +67,7 @@ def without_ledger() -> dict[Place, Any]:
         ),
         (SendWindow, "spend"): rewritten(SendWindow.spend, {"self.sent_ns.append": ""}),
         (SimulatedTime, "look"): rewritten(SimulatedTime.look, {"self._timeline.note": ""}),
-        (MemoryTransport, "_note_digest"): nothing,
+        (MemoryTransport, "_add_digest"): nothing,
         (digests, "digest_of_bytes"): lambda _: 0,
     }
 

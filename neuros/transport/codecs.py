@@ -6,7 +6,7 @@ connections of one output, and a packet is serialised once for all receivers wit
 NeuROS writes and reads CDR without rclpy's detour over C structures: for a small message rclpy
 spends most of the time on looking up Python classes from C. Here the
 layout of a message class is worked out once: runs of numbers become one ``struct`` each, and only
-strings and sequences are looked at one by one. The encoding is that of rclpy (plain CDR,
+strings and sequences are encoded one by one. The encoding is that of rclpy (plain CDR,
 little-endian: OMG DDSI-RTPS 2.5, 10.2, and CORBA 3.3, part 2, 9.3), but gaps are filled with zeros.
 Messages have been checked before (:mod:`neuros.transport.values`). Unusual classes and bytes are
 left to rclpy: single characters, what a plugin made of a message, senders of the other byte order.
@@ -163,22 +163,9 @@ def _parts(entries: Iterable[Leaf | None]) -> Iterator[Part]:
         if run:
             yield Numbers(run)
         run = []
-        yield _part(leaf) if leaf else Nothing()
+        yield _PARTS[leaf.field.shape](leaf) if leaf else Nothing()
     if run:
         yield Numbers(run)
-
-
-def _part(leaf: Leaf) -> Part:
-    field = leaf.field
-    if field.shape is Shape.BUFFER:
-        return Buffer(leaf)
-    if field.shape is Shape.ARRAY:
-        return Array(leaf)
-    if field.shape is Shape.LIST:
-        return Items(leaf, *_item(field.type))
-    if field.type.sort in (Sort.TEXT, Sort.WIDE_TEXT):
-        return Text(leaf, *_item(field.type))
-    raise Unusual
 
 
 def _item(of: Type) -> tuple[WriteItem, ReadItem]:
@@ -289,9 +276,9 @@ class Nothing(Part):
 
 
 class Text(Part):
-    def __init__(self, leaf: Leaf, write: WriteItem, read: ReadItem) -> None:
+    def __init__(self, leaf: Leaf) -> None:
         super().__init__([leaf])
-        self._write, self._read = write, read
+        self._write, self._read = _item(leaf.field.type)
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
         return self._write(self.get(message), pieces, at)
@@ -305,11 +292,11 @@ class Text(Part):
 class Items(Part):
     """Several values that are no numbers: a list."""
 
-    def __init__(self, leaf: Leaf, write_item: WriteItem, read_item: ReadItem) -> None:
+    def __init__(self, leaf: Leaf) -> None:
         super().__init__([leaf])
         self._size = leaf.field.size
         self._most = leaf.field.bound
-        self._write_item, self._read_item = write_item, read_item
+        self._write_item, self._read_item = _item(leaf.field.type)
 
     def write(self, message: Any, pieces: Pieces, at: int) -> int:
         items, write_item = self.get(message), self._write_item
@@ -385,6 +372,14 @@ class Array(Part):
         memoryview(numbers).cast("B")[:] = data[at + _START : end + _START]
         values.append(numbers)
         return end
+
+
+_PARTS: dict[Shape, Callable[[Leaf], Part]] = {
+    Shape.SINGLE: Text,  # numbers are in runs
+    Shape.BUFFER: Buffer,
+    Shape.ARRAY: Array,
+    Shape.LIST: Items,
+}
 
 
 def _aligned(codes: list[str], at: int) -> struct.Struct:

@@ -28,9 +28,9 @@ from neuros.project.model import Connection, NodeFile
 from neuros.transport.codecs import PARCEL_MARK, Decoder, Encoder, message_codec
 from neuros.transport.message_buffers import (
     SHARED_MEMORY,
+    BufferPlace,
     MessageBuffers,
     Overwritten,
-    Place,
     SegmentReader,
     SegmentWriter,
     message_buffers,
@@ -253,7 +253,7 @@ def _is_large(buffers: Sequence[array[Any]]) -> bool:
     return size >= LARGE_BYTES
 
 
-def _parcel(message: bytes, place: Place) -> bytes:
+def _parcel(message: bytes, place: BufferPlace) -> bytes:
     name = place.segment.encode()
     # RTPS pads to four bytes by itself, and the note must be found from the end.
     padding = bytes(-(len(message) + len(name)) % 4)
@@ -269,10 +269,10 @@ def _parcel(message: bytes, place: Place) -> bytes:
     return b"".join((message[:2], PARCEL_MARK, message[4:], padding, lengths, name, note))
 
 
-def _contents(data: bytes) -> tuple[bytes, Place]:
+def _contents(data: bytes) -> tuple[bytes, BufferPlace]:
     at = len(data) - _NOTE.size
     generation, slot_bytes, slot, length, count, name_length = _NOTE.unpack_from(data, at)
     name = data[at - name_length : at].decode()
     lengths = struct.unpack_from(f"<{count}Q", data, at - name_length - 8 * count)
     message = data[:2] + b"\0\0" + data[4:length]
-    return message, Place(name, slot_bytes, slot, generation, lengths)
+    return message, BufferPlace(name, slot_bytes, slot, generation, lengths)

@@ -128,7 +128,7 @@ class MemoryTransport:
         def send(packet: Any) -> None:
             if not self._is_open:
                 return
-            digest = self._note_digest(digested, packet) if digested else None
+            digest = self._add_digest(digested, packet) if digested else None
             for link in links:
                 link.send(copy(packet), digest)
             if bridge.heard:
@@ -167,7 +167,7 @@ class MemoryTransport:
         self._bridge.send_external(port, packet)
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
-        """Return what tells the sender which position every taker has reached."""
+        """Return what tells the sender which position every hook has reached."""
         acknowledge = self._hub.link(connection).acknowledge
 
         def acknowledge_if_open(position: int) -> None:
@@ -215,23 +215,19 @@ class MemoryTransport:
         self._hub.leave(self._name)
         self._bridge.close()
 
-    def _note_digest(self, links: Sequence[MemoryLink], packet: Any) -> int | None:
+    def _add_digest(self, links: Sequence[MemoryLink], packet: Any) -> int | None:
         if self._digest is None:
             return None
         digest = self._digest(packet)
         if digest is None:
-            self._forget_digests()
+            self._digest = None  # of the rest, half would be of no use
+            for connection in self.digests:
+                if connection.source_node == self._name:
+                    self._hub.link(connection).forget_digests()
             return None
         for link in links:
             link.sent.append(digest)
         return digest
-
-    def _forget_digests(self) -> None:
-        """Keep none of what this node sends; half of them would be of no use."""
-        self._digest = None
-        for connection in self.digests:
-            if connection.source_node == self._name:
-                self._hub.link(connection).forget_digests()
 
 
 class _Arrivals:

@@ -113,7 +113,7 @@ _GROWTH = 1.5  # at least, from a segment to its successor
 
 
 @dataclass(frozen=True)
-class Place:
+class BufferPlace:
     """Place of the buffers of one packet; ``lengths`` are theirs, in bytes."""
 
     segment: str
@@ -144,7 +144,7 @@ class SegmentWriter:
         # With the generation from which on no receiver opens it any more.
         self._former: list[tuple[int, _Mapping]] = []
 
-    def write(self, buffers: Sequence[array[Any]]) -> Place:
+    def write(self, buffers: Sequence[array[Any]]) -> BufferPlace:
         """Copy the buffers into the next slot.
 
         Raises:
@@ -163,7 +163,7 @@ class SegmentWriter:
             mapping.bytes[at : at + length] = memoryview(buffer).cast("B")
             at += _aligned(length)
         mapping.generations[start // 8] = self._generation
-        return Place(mapping.name, mapping.slot_bytes, slot, self._generation, lengths)
+        return BufferPlace(mapping.name, mapping.slot_bytes, slot, self._generation, lengths)
 
     def close(self) -> None:
         """Remove all segments; who has mapped one keeps what it has."""
@@ -198,7 +198,7 @@ class SegmentReader:
         self._folder = folder
         self._mapping: _Mapping | None = None
 
-    def read(self, place: Place, typecodes: Sequence[str]) -> list[array[Any]] | None:
+    def read(self, place: BufferPlace, typecodes: Sequence[str]) -> list[array[Any]] | None:
         """Copies of the buffers at a place, of these types.
 
         ``None`` if the whole segment is gone: its sender has ended, or uses a larger one.
@@ -271,7 +271,7 @@ def _create(folder: Path, owner: str, slots: int, slot_bytes: int) -> _Mapping:
     return _Mapping(name, memory, slot_bytes)
 
 
-def _open(folder: Path, place: Place) -> _Mapping:
+def _open(folder: Path, place: BufferPlace) -> _Mapping:
     if not _NAME.fullmatch(place.segment):
         raise ValueError(f"'{place.segment}' is the name of no segment")
     flags = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK

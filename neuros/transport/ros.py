@@ -1,8 +1,9 @@
 """The ROS 2 transport: packets of a node over topics, and the registration of its connections.
 
 A connection has three topics below ``/neuros/<source>/<output>/<destination>/<input>``: ``/data``,
-``/ack`` (the position of the last packet that every taker has started on), and ``/reg``. Who else
-publishes there is named in the log (:class:`neuros.transport.ros_graph.StrangerCheck`).
+``/ack`` (the position of the last packet that every hook of the receiver has started on), and
+``/reg``. The log names strangers that publish there
+(:class:`neuros.transport.ros_graph.StrangerCheck`).
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class SendingLink:
         self.is_open = True
 
     def receive_position(self, data: bytes) -> None:
-        """Hand over the position that every taker has reached."""
+        """Hand over the position that every hook has reached."""
         if self.is_open:
             self._inbox.on_acknowledgement(self._connection, position_of(data))
 
@@ -108,7 +109,7 @@ class ReceivingLink:
             self._deliver(packet)
 
     def acknowledge(self, position: int) -> None:
-        """Publish the position that every taker has reached."""
+        """Publish the position that every hook has reached."""
         if self.is_open and self._publish is not None:
             self._publish(_POSITION.pack(HEADER, position))
 
@@ -137,14 +138,14 @@ _LATCHED = QoSProfile(
     reliability=QoSReliabilityPolicy.RELIABLE,
     durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""QoS of ``/reg`` and ``/ack``: the last message also reaches who comes later."""
+"""QoS of the writers of ``/reg`` and ``/ack``: the last message also reaches later readers."""
 
-_HEARD = QoSProfile(
+_LATCHED_READER = QoSProfile(
     history=QoSHistoryPolicy.KEEP_ALL,
     reliability=QoSReliabilityPolicy.RELIABLE,
     durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
 )
-"""QoS of the readers of ``/reg`` and ``/ack``: messages of others there push out none."""
+"""QoS of the readers of ``/reg`` and ``/ack``: messages of strangers replace none."""
 
 _READY = "ready"
 _CONFIRMED = "confirmed"
@@ -183,7 +184,7 @@ class RosTransport:
         self._external.open(inbox)
         if self._registrations:
             self._loop.expect_arrivals()
-            self._timer = self._loop.every(self._ros_node, _ANNOUNCE_S, self._look_for_others)
+            self._timer = self._loop.every(self._ros_node, _ANNOUNCE_S, self._advance_registrations)
 
     def sender(self, connections: Sequence[Connection]) -> Callable[[Any], bytes | None]:
         """Return what publishes a packet on these data topics, serialised once.
@@ -215,7 +216,7 @@ class RosTransport:
             self._external.send(port, packet)
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
-        """Return what publishes the position that every taker has reached."""
+        """Return what publishes the position that every hook has reached."""
         return self._receiving[connection].acknowledge
 
     @property
@@ -260,7 +261,7 @@ class RosTransport:
         subscriptions = []
         if connection.is_reliable:
             subscriptions.append(
-                self._subscribe(UInt64, connection, "ack", _HEARD, link.receive_position)
+                self._subscribe(UInt64, connection, "ack", _LATCHED_READER, link.receive_position)
             )
         self._registrations.append(
             Registration(
@@ -271,7 +272,7 @@ class RosTransport:
                 is_sender=True,
                 strangers=self._strangers,
                 on_registered=lambda note: self._loop.post(
-                    partial(self._meet_receiver, connection, note, inbox)
+                    partial(self._on_receiver_found, connection, note, inbox)
                 ),
             )
         )
@@ -309,8 +310,8 @@ class RosTransport:
             )
         )
 
-    def _meet_receiver(self, connection: Connection, note: str, inbox: Inbox) -> None:
-        """The receiver of a connection is there, and lets us know ``note`` of itself."""
+    def _on_receiver_found(self, connection: Connection, note: str, inbox: Inbox) -> None:
+        """Choose the codec for a receiver that has sent ``note`` with its registration."""
         link = self._sending[connection]
         if connection.is_jpeg:
             inbox.on_registered(connection)
@@ -345,29 +346,28 @@ class RosTransport:
             raw=True,
         )
 
-    def _look_for_others(self) -> None:
+    def _advance_registrations(self) -> None:
         pending = [each for each in self._registrations if not each.advance()]
         if not pending:
             self._ros_node.destroy_timer(self._timer)
 
 
 class Registration:
-    """One connection, seen from one of its ends, until each end has found the other.
+    """One end of a connection until it has found the other end.
 
-    DDS matches a writer and a reader on each side separately and at different times, and what is
-    sent before both have matched may vanish without a trace. So each end looks at its own
-    endpoints. The receiver announces itself on ``/reg`` once its data reader has matched the
-    sender's writer and its acknowledgement writer the sender's reader. The sender, once its own
-    endpoints have matched and it has heard the announcement, counts the connection as registered
-    and confirms.
+    DDS matches a writer and a reader on each side separately and at different times, and packets
+    sent before both have matched may be lost without a trace. So each end checks its own endpoints.
+    The receiver announces itself on ``/reg`` once its data reader has matched the sender's writer
+    and its acknowledgement writer the sender's reader. The sender, once its own endpoints have
+    matched and it has received the announcement, counts the connection as registered and confirms.
 
-    A number of matches says nothing about *who* matched (a recorder and ``ros2 topic echo`` do,
-    too). An end is taken as found when the ROS graph lists an endpoint of that very node, and all
+    A number of matches does not tell the peer from a recorder or ``ros2 topic echo``. The peer
+    counts as found when the ROS graph lists an endpoint of that very node, and all
     compatible endpoints that the graph lists are matched.
 
     Args:
         strangers: names others that publish on ``/reg``.
-        note: what a receiver lets its sender know of itself, one line.
+        note: one line that a receiver sends with its announcement.
         on_registered: called once, in the loop's thread, when this end is sure of the other;
             a sender gets the receiver's note, a receiver an empty one.
     """
@@ -402,12 +402,12 @@ class Registration:
             String,
             topic,
             self._receive,
-            _HEARD,
+            _LATCHED_READER,
             event_callbacks=strangers.callbacks(connection, topic, *nodes),
         )
 
     def advance(self) -> bool:
-        """Look again, announce or confirm where it is time; returns whether all is done."""
+        """Announce or confirm if the peer is found; returns whether the end is registered."""
         if self.is_done or not self._has_found_peer():
             return self.is_done
         if not self._is_sender:
@@ -437,23 +437,24 @@ class Registration:
         self._on_registered(self._peer_note)
 
     def _has_found_peer(self) -> bool:
-        return all(self._reaches_peer(publisher) for publisher in self._publishers) and all(
-            self._hears_peer(subscription) for subscription in self._subscriptions
-        )
-
-    def _reaches_peer(self, publisher: Publisher) -> bool:
-        matched, own = publisher.get_subscription_count(), publisher.qos_profile
-        if not matched:  # asked first: the graph is searched from end to end for each topic
-            return False
-        listed = self._ros_node.get_subscriptions_info_by_topic(publisher.topic_name)
-        return self._is_among([e for e in listed if is_compatible(own, e.qos_profile)], matched)
-
-    def _hears_peer(self, subscription: Subscription) -> bool:
-        matched, own = subscription.get_publisher_count(), subscription.qos_profile
-        if not matched:
-            return False
-        listed = self._ros_node.get_publishers_info_by_topic(subscription.topic_name)
-        return self._is_among([e for e in listed if is_compatible(e.qos_profile, own)], matched)
+        for publisher in self._publishers:
+            # The count comes first: the graph is searched from end to end for each topic.
+            matched, own = publisher.get_subscription_count(), publisher.qos_profile
+            if not matched:
+                return False
+            listed = self._ros_node.get_subscriptions_info_by_topic(publisher.topic_name)
+            compatible = [each for each in listed if is_compatible(own, each.qos_profile)]
+            if not self._is_among(compatible, matched):
+                return False
+        for subscription in self._subscriptions:
+            matched, own = subscription.get_publisher_count(), subscription.qos_profile
+            if not matched:
+                return False
+            listed = self._ros_node.get_publishers_info_by_topic(subscription.topic_name)
+            compatible = [each for each in listed if is_compatible(each.qos_profile, own)]
+            if not self._is_among(compatible, matched):
+                return False
+        return True
 
     def _is_among(self, compatible: Sequence[TopicEndpointInfo], matched: int) -> bool:
         return matched >= len(compatible) and any(e.node_name == self._peer for e in compatible)

@@ -46,7 +46,7 @@ _EVENTS = 8
 # Python would make this thread give it up. So a loop without pause would keep the thread of the
 # control channel from its work for seconds. It sleeps for a moment now and then, if it has been
 # running for most of the time since the last look.
-_LOOK_NS = 50_000_000
+_CHECK_NS = 50_000_000
 _MOST_BUSY = 0.8
 _GAP_S = 50e-6
 _LONG_S = 3600.0
@@ -81,7 +81,7 @@ class RosLoop:
         self._on_failure = on_failure
         self._waker = _Waker()
         self._events: deque[tuple[Event, bool]] = deque()
-        self._turn = Turn(self._take_turn)
+        self._turn = Turn(self._run_turn)
         self._has_posted_turn = False
         self._is_turn_stale = False
         self.has_taken_in = True
@@ -91,7 +91,7 @@ class RosLoop:
         self._planned_ns: int | None = None
         self._has_older_events = False
         self._is_stopping = False
-        self._looked_ns = 0
+        self._checked_ns = 0
         self._busy_ns = 0  # processor time of this thread at the last look
 
     @property
@@ -231,7 +231,7 @@ class RosLoop:
         self._has_posted_turn = True
         self._executor.create_task(self._turn)
 
-    def _take_turn(self) -> None:
+    def _run_turn(self) -> None:
         self._has_posted_turn = False
         if self._is_turn_stale:
             self._is_turn_stale = False
@@ -241,7 +241,7 @@ class RosLoop:
         self.turns += 1
         events = self._events
         begin_ns = since_ns = now_ns = time.monotonic_ns()
-        if begin_ns - self._looked_ns > _LOOK_NS:
+        if begin_ns - self._checked_ns > _CHECK_NS:
             self._let_other_threads_run(begin_ns)
         length_ns = _TURN_NS
         is_first = True
@@ -259,7 +259,8 @@ class RosLoop:
             if not self.has_taken_in:
                 break
             if now_ns - begin_ns > length_ns:
-                length_ns = max(length_ns, self._fair_turn_ns(now_ns - since_ns))
+                if not self._timers:
+                    length_ns = max(length_ns, min(_LONGEST_TURN_NS, _EVENTS * (now_ns - since_ns)))
                 if now_ns - begin_ns > length_ns:
                     break
         # What a tick sends after a long hook is newer than what waits for the next one.
@@ -274,13 +275,9 @@ class RosLoop:
 
     def _let_other_threads_run(self, now_ns: int) -> None:
         busy_ns = time.thread_time_ns()
-        if busy_ns - self._busy_ns > _MOST_BUSY * (now_ns - self._looked_ns):
+        if busy_ns - self._busy_ns > _MOST_BUSY * (now_ns - self._checked_ns):
             time.sleep(_GAP_S)
-        self._looked_ns, self._busy_ns = now_ns, busy_ns
-
-    def _fair_turn_ns(self, event_ns: int) -> int:
-        """The longest turn with an event that took so long."""
-        return _TURN_NS if self._timers else min(_LONGEST_TURN_NS, _EVENTS * event_ns)
+        self._checked_ns, self._busy_ns = now_ns, busy_ns
 
     def _check_timers(self) -> None:
         """Leave the executor if a timer is due, or due at another time than was planned for."""

@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cache, wraps
 from typing import Any
 
+import numpy  # its first use loads it: 70 ms, and most messages have no arrays
+
 from neuros.errors import WrongValue
 from neuros.transport.schema import Field, Shape, Sort, schema
 from neuros.transport.values import (
@@ -104,8 +106,6 @@ def _to_sequence(field: Field) -> Convert:
 
 def _to_array(field: Field) -> Convert:
     """A function that makes an array of NumPy, of matrices, too: their shape is kept."""
-    import numpy  # here: most messages have no such field, and the import takes 70 ms
-
     code, dtype = field.type.code, numpy.dtype(field.type.code)
 
     def convert(value: Any) -> Any:
@@ -131,8 +131,6 @@ def _unchanged(code: str, values: Sequence[Any]) -> array[Any] | None:
 
 
 def _view_of(field: Field) -> Callable[[Any], Any]:
-    import numpy
-
     slot, name, is_double = field.slot, field.slot[1:], field.type.code == "d"
     to_array, to_number = _to_array(field), single_converter(field.type)
 
@@ -142,20 +140,18 @@ def _view_of(field: Field) -> Callable[[Any], Any]:
 
     converted = _refusing(name, convert)
 
-    class View(_field_array()):  # type: ignore[misc]
+    class CheckedView(_field_array()):  # type: ignore[misc]
         def __setitem__(self, place: Any, value: Any) -> None:
             # Parts of the field have a base; a copy is the plugin's own.
             if not (is_double and type(value) is float) and self.base is not None:
                 value = converted(value)
             super().__setitem__(place, value)
 
-    return lambda message: getattr(message, slot).view(View)
+    return lambda message: getattr(message, slot).view(CheckedView)
 
 
 @cache
 def _field_array() -> Any:
-    import numpy
-
     class FieldArray(numpy.ndarray):
         """A view of the numbers in a field with a fixed number of them; what plugins see."""
 
