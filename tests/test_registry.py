@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 
 import pytest
@@ -41,7 +42,7 @@ def test_the_build_takes_our_parts_from_where_they_are_read() -> None:
 def test_our_parts_are_found_without_any_installation() -> None:
     """As in a container, and in a checkout that was updated and not installed again."""
     program = (
-        "import sys; sys.path.insert(0, '.')\n"
+        f"import sys; sys.path[:0] = ['.', {sysconfig.get_path('purelib')!r}]\n"
         "import neuros.registry as registry\n"
         "registry.BACK_ENDS.load('docker')\n"
         "assert not {'importlib.metadata', 'docker'} & {*sys.modules}"

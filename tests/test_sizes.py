@@ -36,15 +36,15 @@ def test_lines_of_the_core_and_its_extensions() -> None:
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 78_634)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 78_722)
 
 
 def test_private_functions_that_are_used_once() -> None:
-    hold("percent of the functions of neuros/", used_once_percent(NEUROS), 9.4)
+    hold("percent of the functions of neuros/", used_once_percent(NEUROS), 7.2)
 
 
 def test_public_classes_of_one_name() -> None:
-    hold("names in several modules", classes_in_several_modules(NEUROS), 18)
+    hold("names in several modules", classes_in_several_modules(NEUROS), 14)
 
 
 @pytest.fixture(scope="module")
