@@ -58,7 +58,7 @@ EVERY_BACK_END = [
 ]
 DEADLINE_S = 60.0
 EYES = "thrower.eyes"
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "sessions.md"
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "python.md"
 
 ECHO = """
 import time
@@ -708,7 +708,8 @@ def test_the_code_of_the_page_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(cart(tmp_path))
-    (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    _, _, section = PAGE.read_text("utf-8").partition("\n## Sessions\n")
+    (code,) = re.findall(r"```python\n(.*?)```", section.partition("\n### ")[0], re.DOTALL)
     exec(compile(code, str(PAGE), "exec"), {})
     assert "0 the session was closed" in capsys.readouterr().out
 

@@ -34,7 +34,7 @@ def step(node, packet):
         ("geometry_msgs/msg/Twist", ""),
         ("rosgraph_msgs/msg/Clock", ""),
         ("sensor_msgs/msg/Imu", "numpy"),
-        ("std_msgs/msg/Float64MultiArray", "numpy"),
+        ("std_msgs/msg/Float64MultiArray", ""),
     ],
 )
 def test_a_node_has_numpy_only_for_arrays_and_no_yaml(
