@@ -540,7 +540,7 @@ class Deployment(ABC):
         return {}
 
 
-class State(Enum):
+class FindingState(Enum):
     """The state of a finding."""
 
     GOOD = "ok"
@@ -552,22 +552,22 @@ class State(Enum):
 class Finding:
     """A line of ``neuros doctor``."""
 
-    state: State
+    state: FindingState
     subject: str
     text: str
     remedy: str = ""
 
     @classmethod
     def good(cls, subject: str, text: str) -> Finding:
-        return cls(State.GOOD, subject, text)
+        return cls(FindingState.GOOD, subject, text)
 
     @classmethod
     def absent(cls, subject: str, text: str, remedy: str = "") -> Finding:
-        return cls(State.ABSENT, subject, text, remedy)
+        return cls(FindingState.ABSENT, subject, text, remedy)
 
     @classmethod
     def bad(cls, subject: str, text: str, remedy: str = "") -> Finding:
-        return cls(State.BAD, subject, text, remedy)
+        return cls(FindingState.BAD, subject, text, remedy)
 
     def __str__(self) -> str:
         remedy = f": {self.remedy}" if self.remedy else ""

@@ -39,7 +39,7 @@ from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
 from neuros.backends.reaper import Reaper
-from neuros.backends.sessions import Session, reaper_environment, this_process
+from neuros.backends.sessions import RunOnThisMachine, reaper_environment, this_process
 from neuros.backends.sidecars import Recorded
 from neuros.control import CONTROL_VARIABLE, ELSEWHERE_VARIABLE
 from neuros.errors import EnvironmentFault, UsageError, printable
@@ -300,9 +300,9 @@ class Execution:
         """A text of a node with the paths of this machine in it."""
         return self._plan.deployment.as_here(text, self._files[0].folders)
 
-    def _session(self, started: float) -> Session:
+    def _session(self, started: float) -> RunOnThisMachine:
         """The entry of `neuros ps` for this run."""
-        return Session(
+        return RunOnThisMachine(
             self._run_id,
             self._plan.project.name,
             self._plan.back_end.name,

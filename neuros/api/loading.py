@@ -24,7 +24,7 @@ from neuros.distribution import WORKSPACE, python_command
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
-from neuros.project.load import Loaded, load_project
+from neuros.project.load import LoadedProject, load_project
 from neuros.project.loops import Loops, modules_beside
 from neuros.project.message_types import unknown_type
 from neuros.project.model import NETWORK_MODULE, Node, Project
@@ -51,7 +51,7 @@ def load_with_messages(
     remap: Sequence[str] = (),
     *,
     reads_plugins: bool = True,
-) -> tuple[Loaded, Messages]:
+) -> tuple[LoadedProject, Messages]:
     """Load a project and find its message packages.
 
     Args:

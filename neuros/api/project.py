@@ -21,7 +21,7 @@ from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.options import option, takes
 from neuros.project.graph import graph_mermaid, graph_text
-from neuros.project.load import Loaded
+from neuros.project.load import LoadedProject
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
 
@@ -251,7 +251,7 @@ class Project:
             raise
         return LiveRun(plan, is_shown=options.show)
 
-    def _load(self) -> Loaded:
+    def _load(self) -> LoadedProject:
         return load_with_messages(self._path, override_texts(self.settings))[0]
 
     def _load_for_run(self, options: StartOptions) -> tuple[Described, Messages]:

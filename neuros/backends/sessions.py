@@ -26,7 +26,7 @@ _VARIABLE = "NEUROS_GUARDED_RUN"
 
 
 @dataclass(frozen=True)
-class Session:
+class RunOnThisMachine:
     """A run, described by its launcher.
 
     Attributes:
@@ -95,7 +95,7 @@ class Session:
             link.close()
 
 
-def reaper_environment(session: Session) -> dict[str, str]:
+def reaper_environment(session: RunOnThisMachine) -> dict[str, str]:
     """Environment of the reaper of a run."""
     return {_VARIABLE: json.dumps(asdict(session))}
 
@@ -105,12 +105,12 @@ def this_process() -> tuple[int, int]:
     return os.getpid(), started_at(os.getpid()) or 0
 
 
-def sessions() -> list[Session]:
+def sessions() -> list[RunOnThisMachine]:
     """All runs of this user, for root also those of others; oldest first."""
     return sorted(_found(), key=lambda session: session.since)
 
 
-def _found() -> Iterator[Session]:
+def _found() -> Iterator[RunOnThisMachine]:
     mark = f"{_VARIABLE}=".encode()
     for name in filter(str.isdigit, os.listdir("/proc")):
         for variable in environ_of(int(name)):
@@ -119,7 +119,7 @@ def _found() -> Iterator[Session]:
                 with contextlib.suppress(ControlError, ValueError, TypeError, RecursionError):
                     described = json.loads(variable.removeprefix(mark))
                     described |= {"user": _user_of(int(name))}
-                    yield read_as(Session, _harmless(described))
+                    yield read_as(RunOnThisMachine, _harmless(described))
 
 
 def _user_of(pid: int) -> int | None:

@@ -21,7 +21,7 @@ from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuros.backends.sessions import Session, sessions
+from neuros.backends.sessions import RunOnThisMachine, sessions
 from neuros.backends.shared_memory import remove_dead_runs
 from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, UsageError
@@ -117,7 +117,7 @@ def _ps(options: argparse.Namespace) -> int:
     return 0
 
 
-def _rows(session: Session) -> Iterator[_RunningNode]:
+def _rows(session: RunOnThisMachine) -> Iterator[_RunningNode]:
     prefix = f"{session.namespace}/" if session.namespace else ""
     try:
         user = pwd.getpwuid(session.user).pw_name
@@ -175,8 +175,8 @@ def _stop(options: argparse.Namespace) -> int:
 
 
 def _chosen_runs(
-    names: Sequence[str], found: Sequence[Session], *, is_all: bool
-) -> Sequence[Session]:
+    names: Sequence[str], found: Sequence[RunOnThisMachine], *, is_all: bool
+) -> Sequence[RunOnThisMachine]:
     """The named runs among those in progress; without a name, the only one.
 
     Raises:
@@ -194,7 +194,7 @@ def _chosen_runs(
     return [session for session in found if any(_is_named(session, name) for name in names)]
 
 
-def _is_named(session: Session, name: str) -> bool:
+def _is_named(session: RunOnThisMachine, name: str) -> bool:
     is_project = session.project == name and session.is_own
     return is_project or (bool(name) and session.run.startswith(name))
 
@@ -304,7 +304,7 @@ def _hz(options: argparse.Namespace) -> int:
 
 
 def _watch(
-    session: Session,
+    session: RunOnThisMachine,
     wanted: Mapping[str, Mapping[str, Any]],
     node: str,
     period_s: float = _ECHO_PERIOD_S,
@@ -335,7 +335,7 @@ def _watch(
             yield from (m for m in messages if isinstance(m, NodeStatus) and m.node == node)
 
 
-def _run(name: str) -> Session:
+def _run(name: str) -> RunOnThisMachine:
     """The only run of that name. Raises ``UsageError`` for none or several."""
     found = _chosen_runs([name], sessions(), is_all=False)
     if len(found) > 1:
@@ -344,7 +344,7 @@ def _run(name: str) -> Session:
     return found[0]
 
 
-def _topics(session: Session) -> list[_Topic]:
+def _topics(session: RunOnThisMachine) -> list[_Topic]:
     """The topics of a run, in the order of its nodes. Raises ``EnvironmentFault``."""
     found: dict[str, _Topic] = {}
     for name in session.nodes:

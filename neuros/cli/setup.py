@@ -262,7 +262,7 @@ def add_doctor(doctor: argparse.ArgumentParser) -> None:
 
 def _doctor(options: argparse.Namespace) -> int:
     from neuros.doctor.checks import findings
-    from neuros.ports import State
+    from neuros.ports import FindingState
     from neuros.registry import DEPLOYMENTS
 
     found, proves = [], not options.no_delivery
@@ -276,7 +276,7 @@ def _doctor(options: argparse.Namespace) -> int:
             print(finding, flush=True)  # the proofs take seconds
     if options.format == JSON:
         print_json(found)
-    return 4 if any(finding.state is State.BAD for finding in found) else 0
+    return 4 if any(finding.state is FindingState.BAD for finding in found) else 0
 
 
 # ---------------------------------------------------------------------- programs of the checkout

@@ -25,7 +25,7 @@ from neuros.backends.node_command import usable_cores
 from neuros.distribution import install_command, python_command
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.installation.machine import Machine, answer_of, install_opengl, offscreen_opengl
-from neuros.ports import Finding, State
+from neuros.ports import Finding, FindingState
 from neuros.recording.run_file import read_run_file
 from neuros.registry import BACK_ENDS, CHECKS, Part, Registry, option_values
 from neuros.stacks import allow_reading, threads_of
@@ -88,7 +88,7 @@ def look_at_machine(environ: Mapping[str, str]) -> Iterator[Finding]:
     """All findings about this machine, one after another."""
     yield _python()
     ros = installed("ROS 2", "ros-jazzy-rclpy", f"run {install_command()}")
-    yield ros if ros.state is State.GOOD else replace(ros, state=State.BAD)
+    yield ros if ros.state is FindingState.GOOD else replace(ros, state=FindingState.BAD)
     yield installed("Matplotlib", "matplotlib", install_command("plot"))
     yield Finding.good("cores", f"{len(usable_cores())} usable")
     yield _shared_memory(SHARED_MEMORY)

@@ -23,7 +23,7 @@ import neuros.control as control
 from neuros.control import Message
 from neuros.control.link import ControlLink, encode
 from neuros.errors import ControlError
-from neuros.launcher.outcome import Outcome, Output, Phase
+from neuros.launcher.outcome import Outcome, Phase, SupervisorOutput
 from neuros.ports import ControlListener
 
 STRANGER = "an unknown program"
@@ -344,7 +344,7 @@ class Observers:
 class Overheard:
     """An output for people whose records observers get, too."""
 
-    _output: Output
+    _output: SupervisorOutput
     _tell: Callable[[Message], object]
 
     def log(self, severity: str, text: str) -> None:

@@ -22,7 +22,7 @@ SIGNAL_NAMES = {
 }
 
 
-class Output(Protocol):
+class SupervisorOutput(Protocol):
     """Output of the supervisor for people; neither call may wait for a reader.
 
     Records of severity ``DEBUG`` are kept, and not shown.

@@ -19,9 +19,9 @@ from neuros.launcher.outcome import (
     EXIT_CODES,
     SIGNAL_NAMES,
     Outcome,
-    Output,
     Phase,
     Processes,
+    SupervisorOutput,
     names_of,
     nodes_of,
 )
@@ -67,7 +67,7 @@ class Shutdown:
     _probing: Probing
     _peers: Peers
     _outcome: Outcome
-    _output: Output
+    _output: SupervisorOutput
     _signals: list[int]
     _on_stop: Callable[[], object]
     phase: Phase = Phase.RUNNING

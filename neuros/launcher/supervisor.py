@@ -21,9 +21,9 @@ from neuros.launcher.channels import Channels, Observers, Overheard, PauseState,
 from neuros.launcher.finalising import Finalising
 from neuros.launcher.outcome import (
     Outcome,
-    Output,
     Phase,
     Processes,
+    SupervisorOutput,
     nodes_of,
 )
 from neuros.launcher.peers import Peers
@@ -80,7 +80,7 @@ class Supervisor:
         launcher: Launcher,
         environment: Mapping[str, str],
         run_folder: Path,
-        output: Output,
+        output: SupervisorOutput,
         signals: list[int],
         *,
         listener: ControlListener,

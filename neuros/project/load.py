@@ -189,7 +189,7 @@ def _if_valid(read: Callable[[], _T], default: _T) -> _T:
 
 
 @dataclass(frozen=True)
-class Loaded:
+class LoadedProject:
     """A valid project, and warnings of possible mistakes in it."""
 
     project: Project
@@ -206,7 +206,7 @@ def load_project(
     namespace: str | None = None,
     remap: Sequence[str] = (),
     reads_plugins: bool = False,
-) -> Loaded:
+) -> LoadedProject:
     """Load and check a project.
 
     Args:
@@ -267,7 +267,7 @@ def load_project(
         names=names,
         dashboard=dashboard_of(parsed),
     )
-    return Loaded(project, (*remarks(parsed), *doubts))
+    return LoadedProject(project, (*remarks(parsed), *doubts))
 
 
 def _no_project_at(path: Path, file: Path) -> Problem | None:

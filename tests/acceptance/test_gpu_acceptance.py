@@ -19,7 +19,7 @@ from needs import cannot_run
 
 from neuros.cli.main import main
 from neuros.doctor.checks import _gpu, prove_rendering
-from neuros.ports import State
+from neuros.ports import FindingState
 
 pytestmark = pytest.mark.acceptance
 
@@ -68,7 +68,7 @@ def test_a_network_on_the_gpu_turns_a_camera_towards_a_ball(
 
 def test_cameras_render_on_the_gpu() -> None:
     found = prove_rendering({**os.environ, "MUJOCO_GL": "egl"})
-    assert found.state == State.GOOD
+    assert found.state == FindingState.GOOD
     assert "NVIDIA" in found.text
 
 

@@ -18,7 +18,7 @@ from endings import KEEP_THE_GIL, RUNS
 from launching import Running, start
 
 from neuros.backends.reaper import Reaper
-from neuros.backends.sessions import Session, reaper_environment, sessions, this_process
+from neuros.backends.sessions import RunOnThisMachine, reaper_environment, sessions, this_process
 
 PLUGIN = f"from neuros.hooks import neuros_tick\n{RUNS}"
 PROJECT = """
@@ -29,9 +29,9 @@ PROJECT = """
 
 
 @pytest.fixture
-def session() -> Iterator[Session]:
+def session() -> Iterator[RunOnThisMachine]:
     """A run of this process, that has a reaper and nothing else."""
-    session = Session(
+    session = RunOnThisMachine(
         *(secrets.token_hex(8), "demo", "process", ("a",), "/runs/1", time.time(), this_process())
     )
     reaper = Reaper.start(session.run, None, reaper_environment(session))
@@ -40,7 +40,7 @@ def session() -> Iterator[Session]:
     assert session not in sessions()
 
 
-def test_runs_of_other_versions_are_seen_if_they_say_enough(session: Session) -> None:
+def test_runs_of_other_versions_are_seen_if_they_say_enough(session: RunOnThisMachine) -> None:
     ((variable, text),) = reaper_environment(session).items()
     said = json.loads(text)
     newer = {**said, "run": secrets.token_hex(8), "colour": "red"}
@@ -58,7 +58,7 @@ def test_runs_of_other_versions_are_seen_if_they_say_enough(session: Session) ->
 @pytest.mark.parametrize(
     "written", ["{", "[]", "1", '{"run": 1}', "[" * 100_000, '{"nodes": {"a": 1}, "since": "now"}']
 )
-def test_what_describes_no_run_is_passed_over(written: str, session: Session) -> None:
+def test_what_describes_no_run_is_passed_over(written: str, session: RunOnThisMachine) -> None:
     (variable,) = reaper_environment(session)
     reaper = Reaper.start(secrets.token_hex(8), None, {variable: written})
     found = sessions()
@@ -66,7 +66,7 @@ def test_what_describes_no_run_is_passed_over(written: str, session: Session) ->
     assert session in found
 
 
-def test_names_do_nothing_to_a_terminal(session: Session) -> None:
+def test_names_do_nothing_to_a_terminal(session: RunOnThisMachine) -> None:
     ((variable, text),) = reaper_environment(session).items()
     forged = {**json.loads(text), "run": secrets.token_hex(8), "project": "\x1b[2Jdemo\x07"}
     reaper = Reaper.start(forged["run"], None, {variable: json.dumps(forged)})
@@ -75,7 +75,7 @@ def test_names_do_nothing_to_a_terminal(session: Session) -> None:
     assert names[forged["run"]] == "demo\\x07"
 
 
-def test_a_run_is_its_reapers_users_whatever_that_says(session: Session) -> None:
+def test_a_run_is_its_reapers_users_whatever_that_says(session: RunOnThisMachine) -> None:
     ((variable, text),) = reaper_environment(session).items()
     forged = {**json.loads(text), "run": secrets.token_hex(8), "user": os.getuid() + 1}
     reaper = Reaper.start(forged["run"], None, {variable: json.dumps(forged)})
@@ -84,7 +84,7 @@ def test_a_run_is_its_reapers_users_whatever_that_says(session: Session) -> None
     assert users[forged["run"]] == os.getuid()
 
 
-def test_a_launcher_of_another_user_is_none(session: Session) -> None:
+def test_a_launcher_of_another_user_is_none(session: RunOnThisMachine) -> None:
     assert not replace(session, user=os.getuid() + 1).is_led
 
 
@@ -106,18 +106,18 @@ def neuros(*arguments: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def run_of(running: Running) -> Session:
+def run_of(running: Running) -> RunOnThisMachine:
     return next(each for each in sessions() if each.launcher[0] == running.process.pid)
 
 
-def test_a_run_is_there_as_long_as_its_reaper(session: Session) -> None:
+def test_a_run_is_there_as_long_as_its_reaper(session: RunOnThisMachine) -> None:
     assert session in sessions()
     assert session.is_led
     assert session.states() == {"a": "not running"}
 
 
 def test_another_process_with_the_number_of_the_launcher_is_not_the_launcher() -> None:
-    stale = Session("1", "demo", "process", (), "/runs/1", 0.0, (os.getpid(), 1))
+    stale = RunOnThisMachine("1", "demo", "process", (), "/runs/1", 0.0, (os.getpid(), 1))
     assert not stale.is_led
     stale.interrupt()  # and it does not interrupt this test
 
@@ -161,7 +161,7 @@ def test_a_run_whose_launcher_was_killed_is_ending_until_nothing_is_left(folder:
     assert set(session.states().values()) == {"not running"}
 
 
-def test_a_run_that_is_not_there_is_wrong_usage(session: Session) -> None:
+def test_a_run_that_is_not_there_is_wrong_usage(session: RunOnThisMachine) -> None:
     refused = neuros("stop", "nonsense")
     assert refused.returncode == 2
     assert refused.stderr.startswith("neuros: you have no run called 'nonsense'; yours are: ")

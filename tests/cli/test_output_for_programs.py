@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from run_folders import accounting, run_folder
 
-from neuros.backends.sessions import Session
+from neuros.backends.sessions import RunOnThisMachine
 from neuros.cli import live
 from neuros.cli.main import main
 
@@ -37,8 +37,10 @@ def recorded(folder: Path, **more: Any) -> str:
 @pytest.fixture
 def sessions(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [
-        Session("a" * 16, "demo", "process", ("x", "y"), "/runs/1", 5.0, (0, 1), namespace="/left"),
-        Session("b" * 16, "other", "docker", ("x",), "/runs/2", 6.0, (0, 1)),
+        RunOnThisMachine(
+            "a" * 16, "demo", "process", ("x", "y"), "/runs/1", 5.0, (0, 1), namespace="/left"
+        ),
+        RunOnThisMachine("b" * 16, "other", "docker", ("x",), "/runs/2", 6.0, (0, 1)),
     ]
     monkeypatch.setattr(live, "sessions", lambda: found)
 

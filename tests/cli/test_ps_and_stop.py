@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 
-from neuros.backends.sessions import Session
+from neuros.backends.sessions import RunOnThisMachine
 from neuros.cli import live
 from neuros.cli.main import main
 
@@ -31,13 +31,13 @@ class Machine:
     """Runs that can be interrupted, and are then gone."""
 
     def __init__(self) -> None:
-        self.there: list[Session] = []
+        self.there: list[RunOnThisMachine] = []
         self.stopped: list[str] = []
 
     def add(self, run: str, project: str, user: int) -> None:
         machine = self
 
-        class Run(Session):
+        class Run(RunOnThisMachine):
             def interrupt(self) -> None:
                 machine.stopped.append(self.run)
                 machine.there.remove(self)
@@ -97,7 +97,7 @@ def test_a_run_that_saves_something_is_waited_for_and_interrupted_once(
     """A second interrupt would kill it."""
     interrupts: list[str] = []
 
-    class Saves(Session):
+    class Saves(RunOnThisMachine):
         def interrupt(self) -> None:
             interrupts.append(self.run)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from neuros.backends.sessions import Session
+from neuros.backends.sessions import RunOnThisMachine
 from neuros.cli import live
 from neuros.cli.main import main
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
@@ -19,7 +19,7 @@ from neuros.project.split import node_file_text
 @pytest.fixture
 def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Where the only node of the only run has its ``node.json``."""
-    session = Session("a" * 16, "demo", "docker", ("eye",), str(tmp_path), 0.0, (1, 1))
+    session = RunOnThisMachine("a" * 16, "demo", "docker", ("eye",), str(tmp_path), 0.0, (1, 1))
     monkeypatch.setattr(live, "sessions", lambda: [session])
     (tmp_path / "eye").mkdir()
     return tmp_path / "eye" / "node.json"

@@ -12,7 +12,7 @@ import pytest
 
 from neuros.backends.docker.back_end import look_at_containers
 from neuros.doctor import checks
-from neuros.ports import Finding, State
+from neuros.ports import Finding, FindingState
 from neuros.stacks import ProcessThreads
 
 
@@ -22,8 +22,8 @@ def findings(environ: dict[str, str] | None = None) -> dict[str, Finding]:
 
 def test_nothing_is_wrong_with_a_machine_that_runs_the_tests() -> None:
     states = {finding.subject: finding.state for finding in findings().values()}
-    assert State.BAD not in states.values()
-    assert states["Python"] is states["ROS 2"] is states["domain"] is State.GOOD
+    assert FindingState.BAD not in states.values()
+    assert states["Python"] is states["ROS 2"] is states["domain"] is FindingState.GOOD
 
 
 def test_missing_ros_is_a_problem_and_a_missing_simulator_is_not(
@@ -34,9 +34,9 @@ def test_missing_ros_is_a_problem_and_a_missing_simulator_is_not(
 
     monkeypatch.setattr(metadata, "version", version)
     ros, mujoco = findings()["ROS 2"], next(checks.look_at_simulators({}))
-    assert ros.state is State.BAD
+    assert ros.state is FindingState.BAD
     assert "./install.py" in ros.remedy
-    assert mujoco.state is State.ABSENT
+    assert mujoco.state is FindingState.ABSENT
     assert "--extras mujoco" in mujoco.remedy
 
 
@@ -44,7 +44,7 @@ def test_shared_memory_that_is_missing_is_named(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(checks, "SHARED_MEMORY", tmp_path / "none")
-    assert findings()["memory"].state is State.BAD
+    assert findings()["memory"].state is FindingState.BAD
     assert str(tmp_path / "none") in findings()["memory"].text
 
 
@@ -53,26 +53,26 @@ def test_shared_memory_too_small_for_images_is_a_problem(
 ) -> None:
     usage: Any = shutil.disk_usage("/")._replace(free=2**20)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
-    assert findings()["memory"].state is State.BAD
+    assert findings()["memory"].state is FindingState.BAD
     assert "1 MiB free" in findings()["memory"].text
 
 
 def test_a_domain_id_that_is_none_is_a_problem() -> None:
-    assert findings({"ROS_DOMAIN_ID": "many"})["domain"].state is State.BAD
+    assert findings({"ROS_DOMAIN_ID": "many"})["domain"].state is FindingState.BAD
 
 
 def test_whether_a_run_can_show_where_a_node_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert findings()["stacks"].state is State.GOOD
+    assert findings()["stacks"].state is FindingState.GOOD
     monkeypatch.setattr(checks, "threads_of", lambda _: ProcessThreads(problem="nobody may"))
     found = findings()["stacks"]
     assert (found.state, found.text) == (
-        State.ABSENT,
+        FindingState.ABSENT,
         "those of nodes that hang cannot be shown: nobody may",
     )
 
 
 def test_the_display_is_the_one_that_the_environment_names() -> None:
-    assert findings({})["display"].state is State.ABSENT
+    assert findings({})["display"].state is FindingState.ABSENT
     assert findings({"DISPLAY": ":7"})["display"].text == "DISPLAY=:7"
 
 
@@ -83,7 +83,7 @@ def test_a_gpu_tool_that_fails_is_a_problem(
     tool.write_text("#!/bin/sh\nexit 9\n")
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
-    assert findings()["GPU"].state is State.BAD
+    assert findings()["GPU"].state is FindingState.BAD
     tool.write_text("#!/bin/sh\necho 'Some GPU, 555.1'\n")
     assert findings()["GPU"].text == "Some GPU, 555.1"
 
@@ -99,7 +99,7 @@ def test_a_finding_is_one_line_with_its_remedy() -> None:
 def test_without_an_engine_one_line_says_why_and_nothing_is_wrong(tmp_path: Path) -> None:
     environ = {"DOCKER_HOST": f"unix://{tmp_path}/none.sock"}
     (finding,) = look_at_containers(["neuros_python"], environ)
-    assert finding.state is State.ABSENT
+    assert finding.state is FindingState.ABSENT
     assert finding.subject == "Docker"
     assert f"{tmp_path}/none.sock" in finding.text
     gc.collect()

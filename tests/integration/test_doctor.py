@@ -9,13 +9,13 @@ import pytest
 
 from neuros.cli.main import main
 from neuros.doctor.checks import PROJECT, prove_delivery
-from neuros.ports import State
+from neuros.ports import FindingState
 
 
 @pytest.mark.parametrize("backend", ["process", "in-process"])
 def test_images_arrive_and_what_was_read_in_them_comes_back(backend: str) -> None:
     finding = prove_delivery(backend)
-    assert finding.state is State.GOOD, finding
+    assert finding.state is FindingState.GOOD, finding
     assert "20 of 20 on camera.image -> eye.image" in finding.text
     assert "20 of 20 on eye.seen -> camera.seen" in finding.text
 
@@ -26,13 +26,13 @@ def test_what_arrives_damaged_is_a_problem_and_the_reason_is_shown(tmp_path: Pat
     eye = project / "eye.py"
     eye.write_text(eye.read_text().replace("sum(image.data)", "sum(image.data) - 1"))
     finding = prove_delivery("in-process", project)
-    assert finding.state is State.BAD
+    assert finding.state is FindingState.BAD
     assert "arrived with the sum 921599" in finding.remedy
 
 
 def test_a_project_that_cannot_start_is_a_problem(tmp_path: Path) -> None:
     finding = prove_delivery("in-process", tmp_path / "none")
-    assert finding.state is State.BAD
+    assert finding.state is FindingState.BAD
     assert finding.remedy
 
 

@@ -12,9 +12,11 @@ import hashlib
 import types
 from collections import defaultdict, deque
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from typing import Any
+
+import msgspec
 
 from neuros.control import Probed
 from neuros.errors import NeurosError
@@ -168,8 +170,11 @@ def _plain(value: Any, seen: dict[int, int]) -> Any:
         return ("partial", _plain(value.func, seen), _plain(value.args, seen))
     if isinstance(value, World):  # what can change in it is a part of every fingerprint
         return "world"
-    if isinstance(value, Probed):  # there is one round of probes at a time
-        value = replace(value, number=0)
+    if isinstance(value, msgspec.Struct):
+        names = set(value.__struct_fields__)
+        if isinstance(value, Probed):  # there is one round of probes at a time
+            names.remove("number")
+        return (type(value).__name__, *(_plain(getattr(value, n), seen) for n in sorted(names)))
     if is_dataclass(value) and not isinstance(value, type):
         return (type(value).__name__, *(_plain(getattr(value, f.name), seen) for f in fields(value)
                                         if f.name not in _WITHOUT_EFFECT))  # fmt: skip

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from neuros.errors import ProjectError
-from neuros.project.load import Loaded, load_project
+from neuros.project.load import LoadedProject, load_project
 from neuros.project.model import Connection
 from neuros.project.validate import nest_conflicts
 
@@ -34,7 +34,7 @@ class Folder:
         path.write_text(content if isinstance(content, str) else json.dumps(content))
         return path
 
-    def load(self, name: str = "project.json", *overrides: str) -> Loaded:
+    def load(self, name: str = "project.json", *overrides: str) -> LoadedProject:
         return load_project(self.path / name, workspace=self.workspace, overrides=overrides)
 
 

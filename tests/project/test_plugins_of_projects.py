@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuros.errors import HookError, ProjectError
-from neuros.project.load import Loaded, load_project
+from neuros.project.load import LoadedProject, load_project
 from neuros.project.plugin_files import read_plugin
 from neuros.testing import PluginHarness
 
 INT = "std_msgs/msg/Int32"
-Check = Callable[..., Loaded]
+Check = Callable[..., LoadedProject]
 FINE = "@neuros_function(inputs='imu', outputs='rate')\ndef step(node, imu): return imu\n"
 
 
@@ -29,7 +29,7 @@ def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Check:
 
     def check(
         text: str, *, head: str = "from neuros.hooks import *", overrides: Sequence[str] = ()
-    ) -> Loaded:
+    ) -> LoadedProject:
         (tmp_path / "brain.py").write_text(f"{head}\n{textwrap.dedent(text)}")
         (tmp_path / "robot.py").write_text(f"{head}\n@neuros_tick(1)\ndef tick(node): pass")
         project = {

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from rclpy.qos import QoSPresetProfiles
 
-from neuros.project.load import Loaded, load_project
+from neuros.project.load import LoadedProject, load_project
 from neuros.project.model import parameters_of
 from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos, qos_of, qos_to_json
 from neuros.transport.ros_graph import qos_profile
@@ -53,7 +53,7 @@ def test_what_is_written_back_means_the_same(qos: Qos) -> None:
         assert qos_of(qos_to_json(qos), is_input=is_input) == qos
 
 
-def load(folder: Path, **keys: Any) -> Loaded:
+def load(folder: Path, **keys: Any) -> LoadedProject:
     (folder / "a.py").touch()
     port = {"name": "x", "type": "std_msgs/msg/String", "external_topic": "x", **keys}
     node = {"name": "a", "container": "neuros_python", "plugin": "a.py", "inputs": [port]}

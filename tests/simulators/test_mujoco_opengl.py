@@ -18,7 +18,7 @@ import pytest
 
 from neuros.doctor.checks import prove_rendering
 from neuros.installation import machine
-from neuros.ports import State
+from neuros.ports import FindingState
 from neuros.simulators.mujoco import cameras
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -183,13 +183,13 @@ class TestDoctor:
     def test_a_picture_was_rendered(self) -> None:
         needs("egl")
         finding = prove_rendering({})
-        assert finding.state is State.GOOD
+        assert finding.state is FindingState.GOOD
         assert finding.text.startswith("a picture was rendered with EGL (")
 
     def test_opengl_that_does_not_work_is_a_problem_with_its_remedy(self, tmp_path: Path) -> None:
         needs("egl")
         finding = prove_rendering({**without(WHAT_EGL_DRAWS_WITH + OSMESA, tmp_path)})
-        assert finding.state is State.BAD
+        assert finding.state is FindingState.BAD
         assert finding.text.startswith("a camera cannot render: no usable OpenGL (")
         assert machine.OPENGL_PACKAGES in finding.text
 
@@ -198,7 +198,7 @@ class TestDoctor:
     ) -> None:
         monkeypatch.setattr("neuros.doctor.checks.offscreen_opengl", lambda: "")
         finding = prove_rendering(without(EGL + OSMESA, tmp_path))
-        assert finding.state is State.ABSENT
+        assert finding.state is FindingState.ABSENT
         assert "neither EGL" in finding.text
 
 

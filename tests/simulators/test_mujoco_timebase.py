@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.simulators.mujoco.timing import Schedule, Timebase
+from neuros.simulators.mujoco.timing import FiringSchedule, Timebase
 
 HOUR_S = 3600
 
@@ -64,7 +64,7 @@ def test_other_rates_are_refused_with_their_neighbours(rate_hz, says):
 @given(step=st.integers(0, 10**12), periods=st.lists(st.integers(1, 10**6), min_size=1, max_size=5))
 @settings(max_examples=100)
 def test_the_next_firing_is_the_first_multiple_of_any_period(step, periods):
-    schedule = Schedule({str(i): period for i, period in enumerate(periods)})
+    schedule = FiringSchedule({str(i): period for i, period in enumerate(periods)})
     firing = schedule.next_firing(step)
     assert firing > step
     assert schedule.due(firing)
@@ -81,12 +81,14 @@ def test_the_next_firing_is_the_first_multiple_of_any_period(step, periods):
 def test_a_crossing_is_two_firings_without_a_read_between(period, step, count, is_unread):
     is_unread = is_unread and step >= period
     firings = sum(1 for at in range(step + 1, step + count + 1) if at % period == 0)
-    crossing = Schedule({"s": period}).find_crossing({"s"} if is_unread else (), step, step + count)
+    crossing = FiringSchedule({"s": period}).find_crossing(
+        {"s"} if is_unread else (), step, step + count
+    )
     assert (crossing is not None) == (firings + is_unread >= 2)
 
 
 def test_nothing_fires_at_time_zero():
-    schedule = Schedule({"a": 10, "b": 20})
+    schedule = FiringSchedule({"a": 10, "b": 20})
     assert schedule.due(0) == ()
     assert schedule.due(10) == ("a",)
     assert schedule.due(20) == ("a", "b")

@@ -29,7 +29,7 @@ from neuros.backends.process_launchers import ProcessLauncher, RunningProcess, e
 from neuros.backends.pythons import Pythons
 from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
-from neuros.backends.sessions import Session, reaper_environment, this_process
+from neuros.backends.sessions import RunOnThisMachine, reaper_environment, this_process
 from neuros.control import CONTROL_VARIABLE, Message
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError
@@ -268,7 +268,7 @@ class Agent:
         # The first digits are those of the launcher's run; to reapers it is another run.
         run_id = order.run[:8] + os.urandom(4).hex()
         self._domain = choose_domain(int(order.environment["ROS_DOMAIN_ID"]), os.environ, False)
-        session = Session(
+        session = RunOnThisMachine(
             run_id,
             order.project,
             "process",

@@ -26,10 +26,10 @@ from neuros.ports import (
     Deployment,
     DeploymentKind,
     Finding,
+    FindingState,
     Launcher,
     NodeProgram,
     RunningNode,
-    State,
 )
 from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.project.split import node_file_to_json, split, translated
@@ -443,7 +443,7 @@ class _Machines(DeploymentKind):
                 (side,) = machines.sides
                 yield Finding.good(host.name, side.described())
                 for state, subject, text, remedy in side.machine.examine():
-                    yield Finding(State(state), f"{host.name}: {subject}", text, remedy)
+                    yield Finding(FindingState(state), f"{host.name}: {subject}", text, remedy)
             except EnvironmentFault as fault:
                 yield Finding.bad(host.name, str(fault))
                 continue

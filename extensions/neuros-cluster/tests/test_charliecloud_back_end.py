@@ -13,7 +13,7 @@ from neuros_cluster.charliecloud import BACK_END
 from neuros.cli.main import main
 from neuros.distribution import PACKAGE
 from neuros.doctor import checks
-from neuros.ports import State
+from neuros.ports import FindingState
 
 CLOCK = Path(__file__).parents[3] / "examples/1_tick/clock"
 RUNNER = """#!/bin/sh
@@ -88,11 +88,11 @@ def test_a_machine_without_user_namespaces_is_told_before_the_run(
 def test_the_doctor_says_which_images_there_are(folder: Path) -> None:
     environ = {"PATH": str(folder.parent / "bin"), "NEUROS_IMAGE_FOLDER": str(folder)}
     (found,) = BACK_END.checks(environ)
-    assert (found.state, found.text) == (State.GOOD, f"images in {folder}: neuros_python")
+    assert (found.state, found.text) == (FindingState.GOOD, f"images in {folder}: neuros_python")
     (found,) = BACK_END.checks({**environ, "NEUROS_IMAGE_FOLDER": "/none"})
-    assert (found.state, found.text) == (State.ABSENT, "no unpacked images in /none")
+    assert (found.state, found.text) == (FindingState.ABSENT, "no unpacked images in /none")
     (found,) = BACK_END.checks({**environ, "PATH": "/none"})
-    assert found.state is State.ABSENT
+    assert found.state is FindingState.ABSENT
     assert "Charliecloud is not installed" in found.text
 
 

@@ -29,7 +29,7 @@ from two_machines import ADDRESSES, TwoMachines
 from containers import wait_until
 from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses
-from neuros.backends.sessions import Session, sessions
+from neuros.backends.sessions import RunOnThisMachine, sessions
 from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, Watch
 from neuros.control.link import ControlLink
 
@@ -213,7 +213,7 @@ class AtWork:
     """A run with an agent, whose session ``there`` is."""
 
     running: Running
-    there: Session
+    there: RunOnThisMachine
     server: SshServer
 
     @property

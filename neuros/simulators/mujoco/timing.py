@@ -66,7 +66,7 @@ class Timebase:
         )
 
 
-class Schedule:
+class FiringSchedule:
     """The firings of sensors: every ``periods[name]`` steps, first after one period."""
 
     def __init__(self, periods: Mapping[str, int]) -> None:

@@ -21,7 +21,7 @@ from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands
 from neuros.simulators.mujoco.lookup import Problems, did_you_mean, has_any, names_of
 from neuros.simulators.mujoco.sensor_base import Sensor
 from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
-from neuros.simulators.mujoco.timing import Schedule, Timebase
+from neuros.simulators.mujoco.timing import FiringSchedule, Timebase
 
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
@@ -77,7 +77,7 @@ class Declared:
                 periods[sensor.output] = self.time.period_steps(sensor.rate_hz)
             except ValueError as error:
                 problems.add(f"{sensor.pointer}/rate", str(error))
-        self.schedule = Schedule(periods)
+        self.schedule = FiringSchedule(periods)
         self._bound = self._bind(self.model, problems)
         problems.raise_any()
 

@@ -17,7 +17,7 @@ from launching import Finished, Running, start
 from containers import nothing_left, wait_until
 from neuros.backends.docker.settings import shared_memory
 from neuros.backends.run_processes import RUN_ID, RunProcesses
-from neuros.backends.sessions import Session, sessions
+from neuros.backends.sessions import RunOnThisMachine, sessions
 
 HEAD = """
 import ctypes, errno, json, os, pathlib, signal, socket, subprocess, sys, time
@@ -79,7 +79,7 @@ class ContainerBench:
         self.runs.add(self.session(running).run)
         return running
 
-    def session(self, running: Running) -> Session:
+    def session(self, running: Running) -> RunOnThisMachine:
         """The run of a launcher."""
         return next(each for each in sessions() if each.launcher[0] == running.process.pid)
 

@@ -25,7 +25,7 @@ from neuros.backends.docker.engine import engine_socket
 from neuros.backends.docker.launcher import Containers, DockerLauncher
 from neuros.backends.docker.settings import container_name, shared_memory
 from neuros.backends.run_processes import RUN_ID, environ_of
-from neuros.backends.sessions import Session, reaper_environment
+from neuros.backends.sessions import RunOnThisMachine, reaper_environment
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.load import load_project
@@ -584,7 +584,7 @@ def pause(bench: ContainerBench, running: Running) -> None:
         container.pause()
 
 
-def reaper_of(session: Session) -> int:
+def reaper_of(session: RunOnThisMachine) -> int:
     """The number of the process whose environment describes the run."""
     mark = next(f"{key}={value}" for key, value in reaper_environment(session).items()).encode()
     (pid,) = [

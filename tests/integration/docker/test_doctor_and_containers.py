@@ -10,7 +10,7 @@ from containers import require_containers
 from neuros.backends.docker.back_end import look_at_containers
 from neuros.cli.main import main
 from neuros.doctor.checks import prove_delivery
-from neuros.ports import State
+from neuros.ports import FindingState
 
 
 @pytest.fixture(autouse=True)
@@ -20,16 +20,16 @@ def _with_containers() -> None:
 
 def test_engine_and_images_are_named_with_their_versions() -> None:
     engine, image, missing = look_at_containers(["neuros_python", "no_such_image"], os.environ)
-    assert engine.state is image.state is State.GOOD
+    assert engine.state is image.state is FindingState.GOOD
     assert engine.text.startswith("engine ")
     assert image.text.startswith("neuros_python:")
-    assert missing.state is State.ABSENT
+    assert missing.state is FindingState.ABSENT
     assert "'no_such_image'" in missing.text
 
 
 def test_images_pass_from_container_to_container() -> None:
     finding = prove_delivery("docker")
-    assert finding.state is State.GOOD, finding
+    assert finding.state is FindingState.GOOD, finding
     assert "docker: packets arrived: 20 of 20 on camera.image -> eye.image" in finding.text
 
 
