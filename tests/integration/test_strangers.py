@@ -56,7 +56,8 @@ def test_a_run_goes_on_and_names_who_else_publishes(
         RosProgram(name, domain) as program,
     ):
         program.node.create_publisher(kind, f"{TOPIC}/{part}", LATCHED)
-        running.wait_for(f"on {TOPIC}/{part}, others publish, too: {name}.", 60.0)
+        connection = f"[{node}]: source.number -> sink.number"
+        running.wait_for(f"{connection}: on {TOPIC}/{part}, others publish, too: {name}.", 60.0)
         (folder / "sink" / "enough").touch()
         run = running.finish(60.0)
     assert run.exit_code == 0, run.output

@@ -22,7 +22,8 @@ FLOAT = "std_msgs/msg/Float64"
 
 def blocks() -> list[str]:
     """The node, and its hook that sends spikes."""
-    return re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
+    ours, _, _ = PAGE.read_text("utf-8").partition("\n## PyNN and Nengo\n")
+    return re.findall(r"```python\n(.*?)```", ours, re.DOTALL)
 
 
 def estimates(folder: Path, seed: str) -> list[float]:

@@ -14,6 +14,7 @@ from neuros.cli.main import main
 from neuros.distribution import PACKAGE
 from neuros.doctor import checks
 from neuros.ports import FindingState
+from neuros.registry import BACK_ENDS
 
 CLOCK = Path(__file__).parents[3] / "examples/1_tick/clock"
 RUNNER = """#!/bin/sh
@@ -99,7 +100,9 @@ def test_the_doctor_says_which_images_there_are(folder: Path) -> None:
 def test_a_back_end_is_tried_with_the_defaults_of_its_options(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(checks, "_back_ends", lambda: ([BACK_END], []))
+    monkeypatch.setattr(
+        checks, "_parts", lambda registry: ([BACK_END] if registry is BACK_ENDS else [], [])
+    )
     monkeypatch.setattr("neuros_cluster.charliecloud._require_runner", lambda environ: None)
     *_, delivery = (each for each in checks.findings({}, proves=True) if each.subject == "delivery")
     assert "charliecloud: not tried" in delivery.text
