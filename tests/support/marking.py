@@ -61,6 +61,7 @@ BY_NAME = {
         "upgrades/test_upgrades.py",
     ),
     "process": (
+        "extensions/neuros-analysis/tests/test_damaged_run_folders.py",
         "messages/test_stubs.py",
         "recording/test_provenance.py",
         "backends/test_container_pythons.py",
