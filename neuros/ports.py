@@ -592,12 +592,10 @@ class Subcommand:
             exit code. Its optional ``prepare_<command>(parser, arguments)`` adds options that
             depend on other arguments.
         help: the line in ``neuros --help``; empty for a command that only NeuROS uses.
-        is_for_people: whether the output is for a terminal, and not for a log or a program.
     """
 
     module: str
     help: str = ""
-    is_for_people: bool = True
 
 
 @dataclass(frozen=True)

@@ -124,7 +124,8 @@ class TestLockFiles:
 
 def settings_of(listing: str, environ: dict[str, str]) -> dict[str, str]:
     """The variables that uv gets in place of, or besides, those of ``environ``."""
-    found = uv_environment(listing, environ)
+    found, unknown = uv_environment(listing, environ)
+    assert unknown == []
     ours = {k: v for k, v in found.items() if environ.get(k) != v}
     return {k: v for k, v in ours.items() if k not in ("UV_COMPILE_BYTECODE", "UV_SYSTEM_CERTS")}
 
@@ -159,15 +160,18 @@ class TestSettingsOfPip:
         environ = {"UV_DEFAULT_INDEX": "https://mine", "SSL_CERT_FILE": "/my.pem"}
         assert settings_of("global.index-url='https://a'\n", environ) == {}
 
-    def test_folders_of_wheels_are_passed_on(self) -> None:
-        settings = settings_of("global.find-links='/wheels https://wheels'\n", {})
-        assert settings == {"UV_FIND_LINKS": "/wheels,https://wheels"}
+    def test_folders_of_wheels_that_are_not_there_are_left_out(self, tmp_path: Path) -> None:
+        settings = settings_of(f"global.find-links='{tmp_path} {tmp_path}/no https://wheels'\n", {})
+        assert settings == {"UV_FIND_LINKS": f"{tmp_path},https://wheels"}
 
     @pytest.mark.parametrize("name", ["REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE"])
     def test_certificates_for_requests_are_for_uv_too(self, name: str) -> None:
         assert settings_of("", {name: "/my.pem"}) == {"SSL_CERT_FILE": "/my.pem"}
 
-    def test_other_settings_of_pip_are_left_out(self) -> None:
+    def test_settings_that_uv_has_not_are_named(self) -> None:
+        assert uv_environment("global.keyring-provider='import'\n", {})[1] == ["keyring-provider"]
+
+    def test_settings_of_the_output_do_not_matter(self) -> None:
         assert settings_of("global.quiet='1'\n", {}) == {}
 
 
@@ -286,6 +290,13 @@ class TestInstaller:
         self.run(python, environ | ({"UV_COMPILE_BYTECODE": set_to} if set_to else {}))
         assert f"[{is_told}]" in (python.parent.parent / "log").read_text("utf-8")
 
+    def test_a_setting_that_uv_has_not_is_named(
+        self, python: Path, environ: dict[str, str]
+    ) -> None:
+        shown = self.run(python, {**environ, "PIP_PRE": "1"})
+        assert "uv has no setting like pip's pre, and goes without" in shown
+        assert is_installed(python)
+
     def test_where_there_is_no_uv_pip_installs_it(
         self, python: Path, environ: dict[str, str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -380,9 +391,10 @@ class TestHashes:
         self.install(python, f" --hash=sha256:{self.sha256(tmp_path)}", index, tmp_path)
         assert is_installed(python)
 
-    def test_constraints_of_pip_do_not_matter(
+    def test_constraints_of_pip_need_no_hash(
         self, python: Path, index: dict[str, str], tmp_path: Path
     ) -> None:
+        """The lock file names each version, so they have nothing to say; uv takes none there."""
         constraints = tmp_path / "constraints.txt"
         constraints.write_text("neuros-shape<=2\n", "utf-8")
         constrained = {**index, "PIP_CONSTRAINT": str(constraints)}

@@ -61,9 +61,9 @@ COMMANDS = {
         "neuros.cli.setup", "measure what NeuROS costs, compared with the same program without it"
     ),
     "reproduce": Subcommand("neuros.cli.setup", "repeat the published experiments"),
-    "node": Subcommand("neuros.cli.node", is_for_people=False),
-    "import-plugin": Subcommand("neuros.cli.projects", is_for_people=False),
-    "recorder": Subcommand("neuros.cli.recorder", is_for_people=False),
+    "node": Subcommand("neuros.cli.node"),
+    "import-plugin": Subcommand("neuros.cli.projects"),
+    "recorder": Subcommand("neuros.cli.recorder"),
     "replayed": Subcommand("neuros.cli.replay"),
 }
 """Of NeuROS itself; ``neuros.registry.SUBCOMMANDS`` has those of extensions."""
@@ -77,6 +77,8 @@ _WANTED: dict[Any, str] = {
 }
 
 
+# Their output goes to a log, or to a program.
+_FOR_PROGRAMS = {"node", "import-plugin", "recorder"}
 _COMMAND = "COMMAND"
 _IN_WORDS = {
     "expected one argument": "needs a value",
@@ -167,8 +169,7 @@ def main(arguments: Sequence[str]) -> int:
             os.fstat(descriptor)
         except OSError:  # closed: the next file would get its number
             os.open(os.devnull, os.O_RDWR)
-    command = COMMANDS.get(_command_in(arguments))
-    if command is not None and not command.is_for_people:
+    if _command_in(arguments) in _FOR_PROGRAMS:
         return _main(arguments)
     with harmless_output():
         return _main(arguments)

@@ -49,10 +49,17 @@ _IN_UV = {
     "no-cache-dir": "UV_NO_CACHE",
     "trusted-host": "UV_INSECURE_HOST",
     "timeout": "UV_HTTP_TIMEOUT",
+    "default-timeout": "UV_HTTP_TIMEOUT",
     "retries": "UV_HTTP_RETRIES",
+    "constraint": "UV_CONSTRAINT",
     "cert": "SSL_CERT_FILE",
     "client-cert": "SSL_CLIENT_CERT",
     "proxy": "ALL_PROXY",
+}
+_OF_NO_EFFECT = {
+    *("disable-pip-version-check", "no-input", "no-color", "progress-bar", "quiet", "verbose"),
+    *("cache-dir", "log", "prefer-binary", "no-warn-script-location", "no-python-version-warning"),
+    *("root-user-action", "break-system-packages", "require-virtualenv", "config-file"),
 }
 _EXTRA_BYTES = {"tensorflow": 2.5e9, "dev": 0.2e9, "docs": 0.2e9, "benchmark": 0.4e9}
 
@@ -202,7 +209,13 @@ class Installer:
         # uv reads none of pip's files and variables, so pip lists its settings for uv.
         pip = python_command("pip", "config", "list", python=self.python)
         listing = answer_of(pip, self.environ)
-        environ = uv_environment(listing.stdout if listing else "", self.environ)
+        environ, unknown = uv_environment(listing.stdout if listing else "", self.environ)
+        if unknown:
+            names = ", ".join(unknown)
+            self.progress.step(f"uv has no setting like pip's {names}, and goes without")
+        if "--require-hashes" in arguments:
+            # Lock files name every version, and uv refuses a constraint without a hash.
+            environ.pop("UV_CONSTRAINT", None)
         command = [str(self.require_uv()), *_UV_INSTALL, "--python", str(python or self.python)]
         # uv has this variable as an option only.
         if environ.get("UV_NO_INDEX", "0").lower() not in ("0", "no", "off", "false"):
@@ -241,10 +254,10 @@ class Installer:
         return "".join(rows)
 
 
-def uv_environment(listing: str, environ: Mapping[str, str]) -> dict[str, str]:
+def uv_environment(listing: str, environ: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
     """The environment of uv: ``environ`` with the settings of pip as uv's own variables.
 
-    Variables of uv that the user has set stay.
+    Variables of uv that the user has set stay. Also returns the settings of pip that uv lacks.
 
     Args:
         listing: what ``pip config list`` prints.
@@ -253,8 +266,11 @@ def uv_environment(listing: str, environ: Mapping[str, str]) -> dict[str, str]:
     # A variable comes before a file, and a setting of one command before those of all.
     rows.sort(key=lambda row: ("global", "install", ":env:").index(row[0]))
     found = {_IN_UV[key]: str(ast.literal_eval(value)) for _, key, value in rows if key in _IN_UV}
-    if "UV_FIND_LINKS" in found:
-        found["UV_FIND_LINKS"] = ",".join(found["UV_FIND_LINKS"].split())
+    unknown = sorted({key for _, key, _ in rows} - _IN_UV.keys() - _OF_NO_EFFECT)
+    if links := found.pop("UV_FIND_LINKS", ""):
+        # pip ignores a folder that does not exist; for uv it is an error.
+        there = [link for link in links.split() if "://" in link or os.path.exists(link)]
+        found |= {"UV_FIND_LINKS": ",".join(there)} if there else {}
     if "ALL_PROXY" in found:
         found |= dict.fromkeys(("HTTP_PROXY", "HTTPS_PROXY"), found["ALL_PROXY"])
     settings = {k: v for k, v in found.items() if not (k.startswith("UV_") and environ.get(k))}
@@ -263,7 +279,7 @@ def uv_environment(listing: str, environ: Mapping[str, str]) -> dict[str, str]:
         defaults["UV_SYSTEM_CERTS"] = "1"
     if bundle := environ.get("REQUESTS_CA_BUNDLE") or environ.get("CURL_CA_BUNDLE"):
         defaults["SSL_CERT_FILE"] = bundle
-    return {**defaults, **environ, **settings}
+    return {**defaults, **environ, **settings}, unknown
 
 
 def explain_failure(text: str) -> str | None:

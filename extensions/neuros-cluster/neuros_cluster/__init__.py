@@ -6,4 +6,4 @@ EXPORT = Subcommand(
     "neuros_cluster.command", "write a project as files for Docker Compose or Kubernetes"
 )
 PART = Subcommand("neuros_cluster.part")
-AGENT = Subcommand("neuros_cluster.agent", is_for_people=False)
+AGENT = Subcommand("neuros_cluster.agent")

@@ -85,6 +85,12 @@ _CAUSES = (
         "a certificate is not trusted: give your authority's with --ca-bundle FILE",
     ),
     (
+        r"(.*(?:requires BuildKit|dockerfile parse error.*unknown (?:flag|instruction)"
+        r"|BuildKit is enabled but the buildx component is missing).*)",
+        "{}: unless that is a slip of the pen, it takes a newer BuildKit: install docker-buildx"
+        " (from docker.com: docker-buildx-plugin; before docker 23: export DOCKER_BUILDKIT=1)",
+    ),
+    (
         r"(?:Get|Head) \"?https?://([^/\"]+)|lookup (\S+).* no such host",
         "the registry {} cannot be reached: check the network and the engine's proxy, or name an"
         " image that the engine has with --base-image",

@@ -310,6 +310,7 @@ class TestBuildKit:
         code, _, error = bench.build()
         assert (code, bench.tags) == (4, [])
         assert "the --mount option requires BuildKit" in error
+        assert "install docker-buildx" in error
 
 
 def _version(docker: Path) -> str:
