@@ -27,6 +27,7 @@ from neuros.installation.command import (
     build_containers,
     build_documentation,
     extras_of,
+    remove_leftovers,
 )
 from neuros.installation.machine import Machine, clean_environment, explain_missing_library
 from neuros.installation.packages import explain_failure, pip_settings
@@ -187,6 +188,20 @@ def test_the_modules_are_compiled_whatever_python_may_write_by_itself(
     environment.compile()
     cache = f"hooks.{sys.implementation.cache_tag}.pyc"
     assert (tree / "neuros" / "__pycache__" / cache).exists()
+
+
+def test_what_an_update_has_left_of_packages_that_moved_is_removed(tmp_path: Path) -> None:
+    kept = tmp_path / "neuros/snn/__pycache__/nest.pyc"
+    left = [tmp_path / f"neuros/{name}/__pycache__/x.pyc" for name in ("gone", "snn/nir/deep")]
+    for file in (kept, *left):
+        file.parent.mkdir(parents=True)
+        file.touch()
+    (tmp_path / "neuros/snn/nest.py").touch()
+    (tmp_path / "neuros/snn/nir/__pycache__").mkdir()
+    remove_leftovers(tmp_path / "neuros")
+    assert {path.name for path in tmp_path.rglob("*")} == {
+        *("neuros", "snn", "nest.py", "__pycache__", "nest.pyc")
+    }
 
 
 @pytest.fixture(scope="module")

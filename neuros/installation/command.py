@@ -246,6 +246,16 @@ def extras_of(pyproject: str) -> tuple[str, ...]:
     return tuple(re.findall(r"^([\w-]+)\s*=", table.group(1), re.MULTILINE)) if table else ()
 
 
+def remove_leftovers(package: Path) -> None:
+    """Remove subfolders of a package that hold nothing but caches.
+
+    An update of the checkout leaves them of packages that moved, and Python would import them.
+    """
+    for cache in sorted(package.rglob("__pycache__"), reverse=True):  # the innermost first
+        if cache.parent != package and {*cache.parent.iterdir()} == {cache}:
+            shutil.rmtree(cache.parent)
+
+
 class Environment:
     """The virtual environment of a source tree.
 
@@ -288,10 +298,7 @@ class Environment:
         if not os.access(self._root, os.W_OK):
             remedy = f"sudo chown -R $(id -un) {self._root}"
             raise EnvironmentFault(f"{self._root} cannot be written: {remedy}")
-        # An update that removes a package leaves its __pycache__, which Python would import.
-        for folder in sorted((self._root / "neuros").rglob("__pycache__"), reverse=True):
-            if all(each.name == "__pycache__" for each in folder.parent.iterdir()):
-                shutil.rmtree(folder.parent)
+        remove_leftovers(self._root / "neuros")
         version = self.python_version()
         is_new = version is None
         version = version or self._make()

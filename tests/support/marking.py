@@ -50,7 +50,6 @@ BY_NAME = {
         "extensions/neuros-cluster/tests/test_deployment_in_containers.py",
         "extensions/neuros-cluster/tests/test_exported_projects.py",
         "extensions/neuros-cluster/tests/test_slurm_script.py",
-        "extensions/neuros-cluster/tests/test_sweeps_elsewhere.py",
         "benchmarks/test_reproduce_runs.py",
         "conformance/test_conformance.py::test_further_random_projects",
         "conformance/test_conformance.py::test_random_projects",

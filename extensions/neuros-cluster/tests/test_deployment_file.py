@@ -174,3 +174,14 @@ def test_every_deployment_on_the_page_is_valid(tmp_path: Path) -> None:
     for text in shown:
         (tmp_path / "deployment.json").write_text(text)
         load_deployment(tmp_path / "deployment.json")
+
+
+def test_every_deployment_of_the_page_is_valid(tmp_path: Path) -> None:
+    page = Path(__file__).resolve().parents[1] / "README.md"
+    blocks = re.findall(r"```json\n(.*?)```", page.read_text("utf-8"), re.DOTALL)
+    shown = [json.loads(block) for block in blocks]
+    deployments = [each for each in shown if isinstance(each.get("nodes"), dict)]
+    assert deployments
+    for content in deployments:
+        (tmp_path / "deployment.json").write_text(json.dumps(content))
+        load_deployment(tmp_path / "deployment.json")
