@@ -291,13 +291,14 @@ def test_the_tests_of_an_extension_pass_beside_the_wheel_of_the_core_alone(
     run(sys.executable, "-m", "venv", made, cwd=tmp_path, environ=environ)
     python, progress = made / "bin" / "python", Progress(sys.stdout)
     installer = Installer(python, made, tmp_path / "log", progress, environ)
-    for names in (["build"], ["core", "mujoco", "nest", "plot", *DEVELOPER_EXTRAS]):
+    own = extension.folder.name.removeprefix("neuros-")
+    for names in (["build"], ["core", "mujoco", "nest", "plot", own, *DEVELOPER_EXTRAS]):
         locks = [word for name in names for word in ("-r", f"{ROOT}/{LOCKS}/{name}.txt")]
         installer.install(["--no-build-isolation", "--require-hashes", "--no-deps", *locks])
     installer.install(["--no-deps", str(wheel), str(extension.wheel)])
 
     copy = tmp_path / "checkout"  # without neuros/
-    for part in ("tests", "examples", f"extensions/{extension.folder.name}"):
+    for part in ("tests", "benchmarks", "examples", f"extensions/{extension.folder.name}"):
         shutil.copytree(ROOT / part, copy / part, symlinks=True, ignore=LEFT_BEHIND)
     shutil.rmtree(copy / "extensions" / extension.folder.name / extension.package)
     for name in ("conftest.py", "pyproject.toml"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,12 @@ def written(page: Any) -> Any:
     return json.loads("{" + page.input_value("#layout-text") + "}")
 
 
+with_reports = pytest.mark.skipif(
+    find_spec("neuros_analysis") is None, reason="the report of the run is neuros-analysis's"
+)
+
+
+@with_reports
 def test_a_bump_is_seen_moving_in_the_layout_of_the_project_which_a_user_changes(
     tmp_path: Path,
 ) -> None:
@@ -123,6 +130,7 @@ def test_a_bump_is_seen_moving_in_the_layout_of_the_project_which_a_user_changes
 
 
 @pytest.mark.needs(*COMPILER)
+@with_reports
 def test_spikes_are_shown_as_a_raster_with_the_rate_of_the_population(tmp_path: Path) -> None:
     with (
         start(RING / "spiking.json", "--dashboard", "--record", cwd=tmp_path) as running,

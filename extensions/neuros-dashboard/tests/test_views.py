@@ -12,6 +12,8 @@ import requests
 from launching import launch, start
 from neuros_dashboard.web import await_server
 
+from neuros.distribution import install_command
+
 WATCHED = Path(__file__).with_name("watched")
 # A stand-in for a tool with a window: it tells how it was started, and stays.
 TOOL = """\
@@ -61,7 +63,7 @@ def test_where_nothing_can_show_visualisations_nothing_starts(tmp_path: Path) ->
     finished = launch(WATCHED, "-z", cwd=tmp_path, DISPLAY="")
     assert finished.exit_code == 4
     assert "rviz2 needs a display, and Rerun is not installed" in finished.output
-    assert "--extras rerun" in finished.output
+    assert install_command("rerun") in finished.output
     assert finished.run_folder is None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,12 @@ def wait_until(condition: Callable[[], Any]) -> None:
         assert time.monotonic() < give_up_s, "deadline passed"
 
 
+with_reports = pytest.mark.skipif(
+    find_spec("neuros_analysis") is None, reason="the report of the run is neuros-analysis's"
+)
+
+
+@with_reports
 def test_a_robot_is_seen_turning_in_a_browser(tmp_path: Path) -> None:
     with (
         start(PROJECT, *OPTIONS, cwd=tmp_path) as running,
