@@ -3,5 +3,5 @@
 import sys
 from pathlib import Path
 
-if (folder := str(Path(__file__).parents[1])) not in sys.path:
-    sys.path.append(folder)
+_TESTS = Path(__file__).parents[1]
+sys.path += [path for path in map(str, (_TESTS, _TESTS / "support")) if path not in sys.path]

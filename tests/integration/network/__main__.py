@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 _HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(_HERE), str(_HERE.parents[1])]  # as pytest has them
+sys.path[:0] = map(str, (_HERE, _HERE.parents[1], _HERE.parents[1] / "support"))  # as pytest has
 
 from cable import Cable  # noqa: E402
 from conditions import CONDITIONS, Stream, stream  # noqa: E402
