@@ -35,7 +35,7 @@ from neuros.project.model import Connection, NodeFile
 from neuros.replay.recorded_node import RecordedNode
 from neuros.transport.envelope import Traffic
 from neuros.transport.messages import RosPackets
-from neuros.transport.null_middleware import HeldLoop, NullMiddleware
+from neuros.runtime.null_middleware import HeldLoop, NullMiddleware
 
 _POLL_S = 0.1
 _DEBUGPY_HOST = "127.0.0.1"

@@ -33,9 +33,9 @@ from neuros.node.plugin import no_module
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.project.paths import find_module, is_module_name
+from neuros.runtime.local import Record
 from neuros.testing.stand_ins import (
     ManualClock,
-    Record,
     StepLoop,
     Topics,
     Workbench,
