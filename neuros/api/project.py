@@ -8,12 +8,18 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.api.live import LiveRun
-from neuros.api.loading import foreseen_failures, load_with_messages, model_problems, seed_variables
+from neuros.api.loading import (
+    foreseen_failures,
+    load_with_messages,
+    model_problems,
+    seed_variables,
+    with_model_fields,
+)
 from neuros.api.plan import make_environments, make_plan
 from neuros.api.request import Request
 from neuros.api.run import Run
@@ -24,10 +30,12 @@ from neuros.project.graph import graph_mermaid, graph_text
 from neuros.project.load import LoadedProject
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
+from neuros.registry import AUTO
 
 if TYPE_CHECKING:
     from neuros.api.session import Session
 
+LOCAL, IN_PROCESS = "local", "in-process"
 _ENVIRONMENT = "environment"
 
 
@@ -52,12 +60,37 @@ class RunOptions(StartOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class SessionOptions(StartOptions):
-    """The arguments of :meth:`Project.session`."""
+    """The arguments of :meth:`Project.session`: those of a start that make sense for it."""
 
+    nodes: Sequence[str] = field(init=False, default=())
+    network: bool = field(init=False, default=False)
+    peers: str | None = field(init=False, default=None)
+    peer_timeout: int | None = field(init=False, default=None)
+    duration: float | str | None = field(init=False, default=None)
+    placement: bool = field(init=False, default=True)
+    progress: bool | None = field(init=False, default=None)
+    backend: str | None = option(
+        default=LOCAL,
+        variable="NEUROS_BACKEND",
+        page="python.md#sessions",
+        help="run nodes in the thread of this program (local), or on a back end as `project.start`"
+        " does; if something is recorded or monitored, and for a deployment or an isolated run,"
+        " the default is auto",
+    )
+    expose: bool = option(
+        default=False,
+        page="python.md#sessions",
+        help="let ROS tools see the topics of nodes that are in the thread of this program",
+    )
     take_over: Sequence[str] = option(
         is_repeatable=True,
         help="inputs that the session feeds in the place of their connections: robot.wheels",
     )
+
+    @property
+    def needs_processes(self) -> bool:
+        """Whether something is asked for that the nodes of a program's own thread do not have."""
+        return bool(self.recording or self.monitor_system_load or self.deployment or self.isolate)
 
 
 class Project:
@@ -192,29 +225,44 @@ class Project:
     def session(self, options: SessionOptions) -> Session:
         """Start a run that this program steps, and whose packets it reads and sends.
 
-        When this returns, initialise hooks have run, and no other hook.
+        When this returns, initialise hooks have run, and no other hook. By default, the nodes are
+        in the thread of this program: a hook that crashes the process, or never returns, is the
+        program's (see ``timeout_s`` of :meth:`Session.step`).
 
         Raises:
             ProjectError, UsageError, EnvironmentFault: as :meth:`run` does.
             RunError: if the run has ended already.
         """
-        from neuros.api.session import Session  # brings rclpy
-        from neuros.api.session_link import Held, with_session_inputs
+        from neuros.api.local_run import LocalRun  # brings rclpy
+        from neuros.api.session import Session
+        from neuros.api.session_link import Held, HeldRun, LaunchedRun, with_session_inputs
 
-        if options.nodes:
-            raise UsageError("nodes: a session holds all nodes of its project")
+        is_local = options.backend == LOCAL and not options.needs_processes
         count = itertools.count(1)
 
-        def start(seed: int | None) -> Held:
+        def start(seed: int | None, settings: Mapping[str, Any]) -> Held:
             number, output = next(count), None
             if options.output is not None:  # out, out-2, out-3
                 output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
-            own = replace(options, seed=seed, output=output)
+            backend = AUTO if options.backend == LOCAL else options.backend
+            chosen = options.set
+            if isinstance(chosen, Mapping):
+                chosen = with_model_fields(self._loaded.project, chosen)
+            given = [*override_texts(chosen), *override_texts(settings)]
+            own = replace(options, seed=seed, output=output, set=given, backend=backend)
             project, messages = self._load_for_run(own)
             held, inputs = with_session_inputs(project, options.take_over)
-            live = self._live(held, messages, own, is_held=True)
-            live.begin()
-            return Held(live, project, frozenset(inputs), messages.paths)
+            run: HeldRun
+            if is_local:
+                in_process = replace(own, backend=IN_PROCESS)
+                plan = replace(make_plan(held, messages, in_process), request=own)
+                make_environments(plan.pythons, messages, sys.stderr)
+                run = LocalRun(plan, messages.paths, exposes=options.expose)
+            else:
+                live = self._live(held, messages, own, is_held=True)
+                live.begin()
+                run = LaunchedRun(live, len(project.nodes))
+            return Held(run, project, frozenset(inputs), messages.paths)
 
         return Session(start, options.seed)
 

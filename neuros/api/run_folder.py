@@ -13,19 +13,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import platform
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neuros.api.plan import Plan
+from neuros.api.run_record import EXIT_ENVIRONMENT
 from neuros.backends.reaper import Reaper
 from neuros.backends.sidecars import Recorded, RecorderProcess
 from neuros.distribution import WORKSPACE, __version__, python_command
@@ -34,6 +37,10 @@ from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_text, project_to_json
 from neuros.recording.provenance import seeds
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, plan_recording
+from neuros.recording.run_file import RUN_FILE, write_run_file
+
+if TYPE_CHECKING:
+    from neuros.launcher.outcome import Outcome
 
 LAUNCHER_LOG = "launcher.log"
 
@@ -115,6 +122,20 @@ def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
             f"{run_folder} cannot be written to ({error.strerror}): name another folder with -o"
         ) from error
     return files
+
+
+def save_record(record: dict[str, Any], ended: Outcome, folder: Path, run_id: str) -> None:
+    """Write ``run.json``; if the disk is full, into a folder for temporary files."""
+    try:
+        write_run_file(record, folder)
+    except OSError as error:
+        spare = Path(tempfile.gettempdir(), f"neuros-{run_id}")
+        problem = f"{folder / RUN_FILE} cannot be written ({error.strerror})"
+        ended.fail(f"{problem}: it is in {spare} instead, if there is room", EXIT_ENVIRONMENT)
+        record |= {"exit_code": ended.exit_code, "reason": ended.reason}
+        with contextlib.suppress(OSError):
+            spare.mkdir(0o700)
+            write_run_file(record, spare)
 
 
 _PACKAGES = ("ros-jazzy-rclpy", "rosbags", "mujoco", "nest-simulator", "numpy")

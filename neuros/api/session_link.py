@@ -12,24 +12,114 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 from neuros.api.live import LiveRun
-from neuros.backends.control_sockets import SESSION_SOCKET_NAME, connect_unix
-from neuros.control import TO_SESSION, Advance, AtRest, Deliver, Ended, Message
+from neuros.api.run import Run
+from neuros.backends.control_sockets import SESSION_SOCKET_NAME, connect, connect_unix
+from neuros.control import (
+    TO_OBSERVERS,
+    TO_SESSION,
+    Advance,
+    AtRest,
+    Deliver,
+    Ended,
+    LookAll,
+    Message,
+    NodeStatus,
+    Pause,
+    Reset,
+    Resume,
+    WasReset,
+    Watch,
+)
 from neuros.control.link import Arrivals, ControlLink
 from neuros.errors import UsageError
 from neuros.project.model import Node, Port, Project
 from neuros.project.names import SESSION
 from neuros.project.scanner import display_name, place_of
 from neuros.project.suggest import did_you_mean
+from neuros.transport.messages import RosPackets
 
+_CONNECT_S = 0.01
 _MOST_UNSENT = 64
+_Answer = TypeVar("_Answer")
+
+
+class HeldRun(Protocol):
+    """A run that stands still from its start, but for the steps of a session.
+
+    Its answers are those of ``advance`` on the control channel (:class:`neuros.control.AtRest`):
+    simulated times, and the packets after the ``known`` number of each output that is asked for.
+    ``None`` says that the run has ended; :meth:`wait` returns it then.
+
+    Attributes:
+        folder: the run folder.
+        is_behind: whether a step was given up, and nothing has come to rest since.
+        error: of the node that has failed, where it was in this process.
+    """
+
+    folder: Path
+
+    @property
+    def error(self) -> BaseException | None: ...
+
+    @property
+    def is_behind(self) -> bool: ...
+
+    def begin(self, known: Mapping[str, int]) -> AtRest | None:
+        """Wait until the initialise hooks have run."""
+
+    def advance(
+        self,
+        rounds: int,
+        known: Mapping[str, int],
+        end_s: float | None = None,
+        end_sim_s: float | None = None,
+    ) -> AtRest | None:
+        """Go on by rounds, then wait until nothing moves.
+
+        Args:
+            end_s: how long to wait at most (monotonic, seconds).
+            end_sim_s: no round begins at this simulated time; where the nodes are in several
+                processes, some may.
+
+        Raises:
+            TimeoutError: if it takes longer; what goes on is waited for by the next call.
+        """
+
+    def run_for(self, duration_s: float, known: Mapping[str, int]) -> AtRest | None:
+        """Let the run go freely for a wall time, then hold it again, and wait for that."""
+
+    def deliver(self, node: str, input_name: str, packet: Any) -> None:
+        """Put a packet, which has been checked, into the queue of an input."""
+
+    def copy(self, type_name: str, content: Any) -> Any:
+        """A packet of its own for the program, from the content that came with an answer."""
+
+    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+        """Bring all nodes back to their start, paused; ``False`` if they cannot be, or have ended.
+
+        Args:
+            variables: of their environments that change, by node.
+        """
+
+    def look(self) -> Sequence[NodeStatus] | None:
+        """State and counters of each node."""
+
+    def stop(self, reason: str) -> None:
+        """End the run, drained."""
+
+    def interrupt(self, reason: str, exit_code: int) -> None:
+        """End the run now."""
+
+    def wait(self) -> Run:
+        """Wait for the end of the run."""
 
 
 @dataclass(frozen=True)
 class Held:
-    """A run that stands still from its start, for a session.
+    """A run for a session.
 
     Attributes:
         project: as it is described, without the inputs of the session.
@@ -37,10 +127,128 @@ class Held:
         messages: folders of its message packages, for ``sys.path``.
     """
 
-    live: LiveRun
+    run: HeldRun
     project: Project
     inputs: frozenset[str]
     messages: Sequence[Path]
+
+
+class LaunchedRun:
+    """A run in processes of its own (:class:`HeldRun`)."""
+
+    error = None
+
+    def __init__(self, live: LiveRun, nodes: int) -> None:
+        self.folder = live.folder
+        self._live = live
+        self._nodes = nodes
+        self._packets = RosPackets()
+        self._run: Run | None = None
+        try:
+            stream = self._connect()
+            self._link = None if stream is None else SessionLink(stream, self.folder)
+            if self._link is not None:
+                self._link.send(Watch())
+        except BaseException:
+            live.end()
+            raise
+
+    @property
+    def is_behind(self) -> bool:
+        return self._link is not None and self._link.is_behind
+
+    def begin(self, known: Mapping[str, int]) -> AtRest | None:
+        return self._after(lambda link: link.settle(known))
+
+    def advance(
+        self,
+        rounds: int,
+        known: Mapping[str, int],
+        end_s: float | None = None,
+        end_sim_s: float | None = None,
+    ) -> AtRest | None:
+        return self._after(lambda link: link.advance(rounds, known, end_s, end_sim_s))
+
+    def run_for(self, duration_s: float, known: Mapping[str, int]) -> AtRest | None:
+        def run(link: SessionLink) -> AtRest | None:
+            link.send(Resume())
+            try:
+                with contextlib.suppress(TimeoutError):
+                    if not link.wait_for(lambda _: False, time.monotonic() + duration_s):
+                        return None
+            finally:
+                link.send(Pause())
+            return link.settle(known)
+
+        return self._after(run)
+
+    def deliver(self, node: str, input_name: str, packet: Any) -> None:
+        assert self._link is not None
+        self._link.deliver(node, input_name, self._packets.encode(packet))
+
+    def copy(self, type_name: str, content: bytes) -> Any:
+        return self._packets.decode(type_name, content)
+
+    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+        def reset(link: SessionLink) -> WasReset | None:
+            # A round that was given up may go on for ever: it ends as a free run does.
+            at_rest = self.run_for(0.0, {}) if link.is_behind else link.advance(0, {}, None)
+            if at_rest is None:
+                return None
+            link.send(Reset(variables))
+            return link.answer(WasReset)
+
+        answer = self._after(reset)
+        return answer is not None and not answer.why_not
+
+    def look(self) -> Sequence[NodeStatus] | None:
+        found: dict[str, NodeStatus] = {}
+
+        def is_last(message: Message) -> bool:
+            if isinstance(message, NodeStatus):
+                found[message.node] = message
+            return len(found) == self._nodes
+
+        def look(link: SessionLink) -> Sequence[NodeStatus] | None:
+            if not link.is_behind:  # else a round goes on, perhaps for ever
+                link.advance(0, {}, None)  # what was sent has arrived then
+            link.send(LookAll({}))
+            return [*found.values()] if link.wait_for(is_last, None) else None
+
+        return self._after(look)
+
+    def stop(self, reason: str) -> None:
+        if self._link is not None:
+            self._link.leave_nodes()
+        self._live.stop(reason)
+
+    def interrupt(self, reason: str, exit_code: int) -> None:
+        self._live.interrupt()
+
+    def wait(self) -> Run:
+        if self._run is None:
+            if self._link is not None:
+                self._link.leave_nodes()
+            self._run = self._live.wait()
+            if self._link is not None:
+                self._link.close()
+        return self._run
+
+    def _after(self, ask: Callable[[SessionLink], _Answer | None]) -> _Answer | None:
+        """The answer to a question; ``None`` if the run has ended."""
+        return None if self._link is None or self._run is not None else ask(self._link)
+
+    def _connect(self) -> ControlLink | None:
+        """The connection to the supervisor; ``None`` if the run has ended before."""
+        while True:
+            try:
+                return ControlLink(
+                    connect(self._live.control_address), TO_OBSERVERS, "the supervisor"
+                )
+            except OSError:
+                with contextlib.suppress(TimeoutError):
+                    self._run = self._live.wait(_CONNECT_S)
+                    return None
 
 
 class SessionLink:
@@ -151,6 +359,17 @@ class SessionLink:
                     self._hear_nodes()  # an answer that is no longer waited for
                 elif (is_there := self._hear_supervisor(is_wanted)) is not None:
                     return is_there
+
+    def answer(self, kind: type[_Answer]) -> _Answer | None:
+        """The next message of a kind from the supervisor; ``None`` if the run has ended."""
+        answers: list[_Answer] = []
+
+        def is_answer(message: Message) -> bool:
+            if isinstance(message, kind):
+                answers.append(message)
+            return bool(answers)
+
+        return answers[0] if self.wait_for(is_answer, None) else None
 
     def leave_nodes(self) -> None:
         """Send what waits, and hear the nodes no more: none waits for its answer to be read."""
@@ -270,15 +489,18 @@ def port_of(project: Project, name: str, *, is_input: bool) -> tuple[Node, Port]
     """
     node_name, _, port_name = name.partition(".")
     nodes = {node.name: node for node in project.nodes}
-    if node_name not in nodes or not port_name:
+    if node_name not in nodes:
         hint = did_you_mean(node_name, nodes) or f"it has {', '.join(nodes)}"
         file = display_name(project.file)
         raise UsageError(f"'{name}': {file} has no node '{node_name}' ({hint}); say node.port")
     node = nodes[node_name]
     ports = {port.name: port for port in (node.inputs if is_input else node.outputs)}
+    side = "input" if is_input else "output"
+    if not port_name:
+        known = ", ".join(f"{node_name}.{port}" for port in ports) or "none"
+        raise UsageError(f"'{name}' is a node: name one of its {side}s, which are {known}")
     if port_name not in ports:
         hint = did_you_mean(port_name, ports) or f"it has {', '.join(ports) or 'none'}"
-        side = "input" if is_input else "output"
         raise UsageError(f"'{name}': no such {side} ({hint}); {declared_at(node)}")
     return node, ports[port_name]
 

@@ -256,8 +256,8 @@ class AtRest(Message):
 
     Attributes:
         sim_times: of nodes that own simulated time, in seconds.
-        packets: by output (``robot.imu``), the number of its newest packet, from 1, and its ROS
-            serialisation; only if it is newer than the known number.
+        packets: by output (``robot.imu``), the number of its newest packet, from 1, and in their
+            ROS serialisation, the packets after the known number, as far as they are kept.
         nodes: of the process.
         is_active: whether each node has found its receivers, and may start all its hooks.
         sent: by connection to another process, packets sent and acknowledged; -1: it may lose some.
@@ -266,7 +266,7 @@ class AtRest(Message):
 
     number: int
     sim_times: Mapping[str, float]
-    packets: Mapping[str, tuple[int, bytes]]
+    packets: Mapping[str, tuple[int, list[bytes]]]
     nodes: tuple[str, ...] = ()
     is_active: bool = True
     sent: Mapping[str, tuple[int, int]] = {}

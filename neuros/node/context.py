@@ -133,6 +133,12 @@ class ContextSwitch:
         """Give the process its own context back (but for its output, if a node has a log)."""
         self.enter(self._process)
 
+    def close(self) -> None:
+        """Leave the import system as it was before."""
+        self.leave()
+        if self in sys.meta_path:
+            sys.meta_path.remove(self)
+
     def why_bound(self, context: Context) -> str:
         """Which library holds state of this node outside of its modules; empty if none does."""
         names = [name for name, owner in self._owners.items() if owner is context]

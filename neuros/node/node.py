@@ -20,7 +20,7 @@ from neuros.hooks import HookKind, HookSpec
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices, Results
-from neuros.node.instruments import Instrument, NewestPackets, NodeRecorder, Tap
+from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Tap
 from neuros.node.logs import WorldLog
 from neuros.node.plugin import describe, last_line, load_plugin
 from neuros.node.reports import NodeReports
@@ -44,11 +44,12 @@ class NodeRuntime:
         on_initialised: called after each initialise hook.
         clock: monotonic clock in nanoseconds.
         make_engine: the engine, called like its class.
-        is_held: whether hooks stand still from the start, as paused, and the newest packet of each
-            output is kept.
+        is_held: whether hooks stand still from the start, as paused, and the newest packets of each
+            output are kept.
+        is_local: whether the session that holds it is in the same thread.
 
     Attributes:
-        newest: the newest packets, where they are kept.
+        histories: the newest packets, where they are kept.
         engine: ``None`` until :meth:`load`.
         specs: the hooks of its plugin, once that is loaded; after a reset, those that hold then.
         handle: the ``node`` that hooks receive.
@@ -71,6 +72,7 @@ class NodeRuntime:
         clock: Callable[[], int] = time.monotonic_ns,
         make_engine: Callable[..., Engine] = Engine,
         is_held: bool = False,
+        is_local: bool = False,
     ) -> None:
         self.file = file
         self.name = file.node.name
@@ -114,9 +116,11 @@ class NodeRuntime:
             )
             instruments.append(self._recorder)
         self._is_held = is_held
-        self.newest = NewestPackets(middleware.packets.encode)
+        packets = middleware.packets
+        copy_of = (lambda port: packets.copier(port.type)) if is_local else None
+        self.histories = PacketHistories(packets.encode, copy_of)
         if is_held:
-            instruments.append(self.newest)
+            instruments.append(self.histories)
         self._effects = NodeEffects(
             middleware,
             self._transport,
@@ -234,7 +238,7 @@ class NodeRuntime:
         self._enter()
         self._time.begin_anew(keeps_owner=is_kept)
         self._services.results.clear()
-        self.newest.by_output.clear()
+        self.histories.by_output.clear()
         if is_kept:
             self.specs = [
                 replace(spec, kind=HookKind.INITIALISE) if spec.kind is HookKind.RESET else spec

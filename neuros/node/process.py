@@ -578,12 +578,12 @@ def signals_as_socket() -> Iterator[tuple[socket.socket, socket.socket]]:
 
 
 def _at_rest(nodes: Sequence[NodeRuntime], asked: Advance) -> control.AtRest:
-    """Times and newest packets of all nodes of a process at one moment."""
+    """Times and new packets of all nodes of a process at one moment."""
     packets = {
-        name: newest
+        name: (history.count, history.since(asked.known[name]))
         for node in nodes
-        for output, newest in node.newest.by_output.items()
-        if newest[0] > asked.known.get(name := f"{node.name}.{output}", newest[0])
+        for output, history in node.histories.by_output.items()
+        if (name := f"{node.name}.{output}") in asked.known and history.count > asked.known[name]
     }
     times = {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None}
     return control.AtRest(asked.number, times, packets)

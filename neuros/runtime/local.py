@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 Event = Callable[[], None]
 
 _SLICE_S = 0.005
-"""How long ROS may keep events of threads waiting, and they ROS, while nothing else is to be done."""
+"""How long ROS may keep events of threads waiting, and they ROS, while a run is idle."""
 _NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 

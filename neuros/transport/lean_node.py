@@ -352,7 +352,7 @@ def _not_for_plugins(name: str) -> NodeError:
 
 
 def entities(ros_node: RosNode) -> set[int]:
-    """Marks of all that exists on a ROS node: subscriptions, timers, services, clients, waitables."""
+    """Marks of the subscriptions, timers, services, clients and waitables of a ROS node."""
     groups = (ros_node.subscriptions, ros_node.timers, ros_node.services, ros_node.clients)
     return {id(entity) for group in groups for entity in group} | {
         id(waitable) for waitable in ros_node.waitables

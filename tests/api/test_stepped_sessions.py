@@ -52,6 +52,7 @@ pytestmark = pytest.mark.filterwarnings(
 )
 ACCEPTANCE = pytest.mark.acceptance
 EVERY_BACK_END = [
+    "local",
     "in-process",
     pytest.param("process", marks=ACCEPTANCE),
     pytest.param("docker", marks=ACCEPTANCE),
@@ -198,19 +199,21 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
-@pytest.fixture(scope="module")
-def held(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+@pytest.fixture(scope="module", params=["local", "in-process"])
+def held(
+    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Iterator[Session]:
     """A session whose steps no test counts from the start."""
     folder = tmp_path_factory.mktemp("held")
     project = neuros.Project.from_file(cart(folder))
-    with project.session(backend="in-process", output=folder / "run") as s:
+    with project.session(backend=request.param, output=folder / "run") as s:
         yield s
 
 
 @contextlib.contextmanager
 def ended_at_the_deadline(s: Session) -> Iterator[None]:
     """Whatever hangs in there fails instead, since the run is interrupted."""
-    timer = threading.Timer(DEADLINE_S, s._live.interrupt)
+    timer = threading.Timer(DEADLINE_S, s._held.interrupt, ("it hangs", 1))
     timer.start()
     try:
         yield
@@ -400,7 +403,7 @@ def test_a_wrong_packet_of_an_observer_is_refused_and_the_session_goes_on(
 ) -> None:
     with neuros.Project.from_file(cart(tmp_path)).session(backend=back_end) as s:
         log = s.folder / "robot" / "node.log"
-        assert reason in refusals(s._live, log, Deliver("robot", input_name, data))
+        assert reason in refusals(s._held._live, log, Deliver("robot", input_name, data))
         assert poses(s, 2) == [1.0, 0.5]
     assert s.close().exit_code == 0
     assert "Traceback" not in log.read_text("utf-8")
@@ -422,9 +425,9 @@ def test_in_a_run_that_is_no_session_every_packet_of_an_observer_is_refused(
 
 def test_a_step_with_a_packet_for_no_node_fails_the_run_in_a_sentence(tmp_path: Path) -> None:
     with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
-        s._link.deliver("nobody", "push", b"")
-        s._link.advance(1, {"nobody.pose": 0}, time.monotonic() + DEADLINE_S)
-        run = s._live.wait(DEADLINE_S)
+        s._held._link.deliver("nobody", "push", b"")
+        s._held._link.advance(1, {"nobody.pose": 0}, time.monotonic() + DEADLINE_S)
+        run = s._held._live.wait(DEADLINE_S)
     assert run.exit_code == 1
     assert "a packet came for 'nobody.push', no session's input" in run.reason
 
@@ -547,7 +550,7 @@ def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_f
         assert s["robot.pose"].count == 0
         with pytest.raises(TimeoutError):
             s.step(timeout_s=0.5)
-        s._link._supervisor.send(Advance(10_000, 0, {}))
+        s._held._link._supervisor.send(Advance(10_000, 0, {}))
         (s.folder / "brain" / "go").touch()
         s.step(timeout_s=DEADLINE_S)
         assert s["robot.pose"].count == 2
@@ -576,7 +579,7 @@ def test_after_a_step_that_took_too_long_a_large_packet_and_a_large_answer_pass_
         assert s["brain.image"].packet.data[-1] == 1
 
 
-@pytest.mark.parametrize("back_end", ["in-process", "process"])
+@pytest.mark.parametrize("back_end", ["local", "in-process", "process"])
 def test_a_round_that_never_ends_hinders_nothing_but_steps(tmp_path: Path, back_end: str) -> None:
     project = neuros.Project.from_file(rally(tmp_path))
     with project.session(backend=back_end) as s, ended_at_the_deadline(s):
@@ -607,9 +610,9 @@ def test_a_step_that_arrives_once_the_run_goes_freely_does_not_hold_it(tmp_path:
     (tmp_path / "eye.py").write_text(ALARM)
     (tmp_path / "project.json").write_text(json.dumps({"nodes": [alarm]}))
     with neuros.Project.from_file(tmp_path).session(backend="in-process") as s:
-        nodes = s._link._nodes
+        nodes = s._held._link._nodes
         assert nodes is not None
-        s._link.send(Resume())
+        s._held._link.send(Resume())
         looks = s.folder / "eye" / "looks"
         wait_until(looks.exists)
         nodes.send(Advance(10_000, 1, {}))
@@ -660,16 +663,16 @@ def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_
                 s.step(timeout_s=0.0)
         finally:
             node.resume()
-        assert s._link._nodes is not None
-        assert select.select([s._link._nodes], [], [], DEADLINE_S)[0]
-        s._live.interrupt()
-        run = s._live.wait(DEADLINE_S)
+        assert s._held._link._nodes is not None
+        assert select.select([s._held._link._nodes], [], [], DEADLINE_S)[0]
+        s._held._live.interrupt()
+        run = s._held._live.wait(DEADLINE_S)
     assert run.exit_code == 130
     assert run.nodes["eye"]["report"] == "final"
 
 
 @pytest.mark.filterwarnings("ignore:.*of node 'seer' is not connected")
-@pytest.mark.parametrize("backend", ["in-process", "process"])
+@pytest.mark.parametrize("backend", ["local", "in-process", "process"])
 def test_packets_that_are_sent_at_once_are_all_there_however_large(
     tmp_path: Path, backend: str
 ) -> None:
@@ -761,7 +764,7 @@ def test_a_length_that_is_none_is_refused(
 
 def test_what_a_session_cannot_be_is_said_before_anything_starts(tmp_path: Path) -> None:
     project = neuros.Project.from_file(cart(tmp_path))
-    with pytest.raises(UsageError, match="a session holds all nodes"):
+    with pytest.raises(TypeError, match=r"Project.session\(\) got an unexpected keyword.*'nodes'"):
         project.session(nodes=["robot"])
     with pytest.raises(UsageError, match=r"did you mean 'wheels'\?"):
         project.session(take_over="robot.wheel")

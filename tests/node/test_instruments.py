@@ -68,7 +68,10 @@ def test_the_sampler_knows_an_external_input_by_its_topic() -> None:
 def test_the_recorder_is_on_the_taps_that_are_recorded_and_encodes_once() -> None:
     kept, records = Kept(), []
     recorder = NodeRecorder(
-        kept, lambda packet: b"made", lambda: 1.5, LocalLogger("a", lambda _, record: records.append(record))
+        kept,
+        lambda packet: b"made",
+        lambda: 1.5,
+        LocalLogger("a", lambda _, record: records.append(record)),
     )
     taps = [Tap(Way.SENT, NUMBER), Tap(Way.SENT, CLOCK), Tap(Way.RECEIVED, NUMBER, CONNECTION)]
     for tap in taps:
@@ -81,7 +84,12 @@ def test_the_recorder_is_on_the_taps_that_are_recorded_and_encodes_once() -> Non
 
 def test_a_recorder_that_fails_says_so_once_and_the_node_goes_on() -> None:
     kept, records = Kept(), []
-    recorder = NodeRecorder(kept, lambda packet: b"", lambda: None, LocalLogger("a", lambda _, record: records.append(record)))
+    recorder = NodeRecorder(
+        kept,
+        lambda packet: b"",
+        lambda: None,
+        LocalLogger("a", lambda _, record: records.append(record)),
+    )
     tap = Tap(Way.SENT, NUMBER)
     recorder.attach(tap)
     kept.is_full = True
