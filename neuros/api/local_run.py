@@ -5,13 +5,14 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
+import math
 import os
 import signal
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -41,6 +42,7 @@ NAME = "local"
 
 _DRAIN_S = 5.0
 _REPORT_S = 1.0
+_CELL_S = 0.02
 _FRAMES = 8
 _CHECKS = 100
 _GRACE_S = 1.0
@@ -73,7 +75,6 @@ class LocalRun:
         self._git = GitState(project.folder)
         self.folder = make_run_folder(request.output, project.name)
         self._files = write_node_files(plan, self.folder)
-        self._folder_fd = os.open(self.folder, os.O_RDONLY | os.O_DIRECTORY)
         self._outcome = Outcome()
         self._declarations = Declarations(self._files)
         self._ready: set[str] = set()
@@ -93,6 +94,13 @@ class LocalRun:
         self._contexts = ContextSwitch()
         self._contexts.hide_from_nodes(project.folder)
         self._nodes: dict[str, NodeRuntime] = {}
+        self._thread = _Thread(
+            self.folder,
+            self._loop,
+            self._contexts.leave,
+            self._describe_hang,
+            self._fail_after_hang,
+        )
         atexit.register(self._end_with_program)
         try:
             with self._inside():
@@ -291,29 +299,9 @@ class LocalRun:
         times = {n.name: time_s for n in self._nodes.values() if (time_s := n.sim_time) is not None}
         return AtRest(0, times, packets)
 
-    @contextlib.contextmanager
-    def _inside(self, end_s: float | None = None) -> Iterator[None]:
-        """Run nodes in their folder, until a time; Ctrl+C comes between two hooks.
-
-        Raises:
-            TimeoutError: once the time (monotonic, seconds) has come.
-            KeyboardInterrupt: Ctrl+C; a second one interrupts the hook that runs.
-        """
-        before = os.open(".", os.O_PATH | os.O_DIRECTORY)
-        os.fchdir(self._folder_fd)
-        watchdog = None if end_s is None else _Watchdog(end_s, self._loop, self._describe_hang)
-        try:
-            with _DeferredInterrupt(self._loop), watchdog or contextlib.nullcontext():
-                yield
-        except _DidNotReturn as error:  # in the midst of the engine, whose state is unknown now
-            self._outcome.fail(str(error))
-        finally:
-            self._contexts.leave()
-            os.fchdir(before)
-            os.close(before)
-        if watchdog is not None and watchdog.hang:
-            self._finish()
-            raise TimeoutError(watchdog.hang)
+    def _inside(self, end_s: float | None = None) -> _Thread:
+        """The thread of the program for nodes, until a time (monotonic, seconds)."""
+        return self._thread.until(end_s)
 
     def _describe_hang(self, thread: int) -> str:
         """Where a hook stands that does not return, and the time that is over."""
@@ -326,6 +314,12 @@ class LocalRun:
                 self._write(node.name, Record("ERROR", text))
                 return f"node '{node.name}': {text}"
         return f"the step did not end in time; it stood here:\n{stack}"
+
+    def _fail_after_hang(self) -> None:
+        """A hook was interrupted, or the engine, whose state is unknown then."""
+        if not self._outcome.failures:
+            self._outcome.fail("a step that took too long was interrupted")
+        self._finish()
 
     # ------------------------------------------------------------------ what nodes say
 
@@ -387,7 +381,7 @@ class LocalRun:
         finally:
             self._middleware.close()
             self._contexts.close()
-            os.close(self._folder_fd)
+            self._thread.close()
             atexit.unregister(self._end_with_program)
             self._record()
             self._run = Run(self.folder)
@@ -428,37 +422,107 @@ class LocalRun:
         self.interrupt("the program ended before it closed the session", EXIT_CODES[signal.SIGINT])
 
 
-class _DidNotReturn(BaseException):
+class StepTimeout(BaseException):
     """Interrupts a hook that has run for longer than its step may take."""
 
     def __str__(self) -> str:
         return "it did not return within the time-out of the step"
 
 
-class _DeferredInterrupt:
-    """Has Ctrl+C wait for the hook that runs; a second one does not wait."""
+class _Thread:
+    """The thread of the program while nodes run in it.
 
-    def __init__(self, loop: LocalLoop) -> None:
+    Their folder is the current one then. Ctrl+C waits for the hook that runs; a second one does
+    not.
+
+    Args:
+        folder: the run folder.
+        leave: gives the process its own environment and modules back.
+        describe_hang: where the thread of this number stands.
+        on_hang: called outside, after a hook that did not return has been interrupted.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        loop: LocalLoop,
+        leave: Callable[[], None],
+        describe_hang: Callable[[int], str],
+        on_hang: Callable[[], None],
+    ) -> None:
+        self._folder = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        self._program_path, self._program_folder = "", -1
         self._loop = loop
-        self._is_installed = False
+        self._leave = leave
+        self._describe_hang = describe_hang
+        self._on_hang = on_hang
+        self._watchdog: _Watchdog | None = None
+        self._is_inside = False
+        self._left_s = -math.inf
+
+    def until(self, end_s: float | None) -> _Thread:
+        """Interrupt at a time (monotonic, seconds)."""
+        if end_s is not None:
+            self._watchdog = _Watchdog(end_s, self._loop, self._describe_hang)
+        return self
 
     def __enter__(self) -> None:
-        if threading.current_thread() is threading.main_thread():
-            self._is_installed = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-            if self._is_installed:
-                signal.signal(signal.SIGINT, self._handle)
+        path = os.getcwd()
+        if path != self._program_path:
+            if self._program_folder >= 0:
+                os.close(self._program_folder)
+            self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
+            self._program_path = path
+        os.fchdir(self._folder)
+        # A notebook exchanges the handler with each cell, so it is looked at after a pause.
+        if time.monotonic() - self._left_s > _CELL_S:
+            self._handle_interrupts()
+        self._is_inside = True
+        if self._watchdog is not None:
+            self._watchdog.begin()
 
-    def _handle(self, number: int, frame: FrameType | None) -> None:
-        if self._loop.interruption is not None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
+    ) -> None:
+        watchdog, self._watchdog = self._watchdog, None
+        hang = ""
+        try:
+            if watchdog is not None:
+                watchdog.end()
+                hang = watchdog.hang
+        except StepTimeout:
+            hang = watchdog.hang if watchdog is not None else ""
+        self._is_inside = False
+        self._leave()
+        os.fchdir(self._program_folder)
+        self._left_s = time.monotonic()
+        interruption, self._loop.interruption = self._loop.interruption, None
+        if hang:
+            self._on_hang()
+            raise TimeoutError(hang)
+        if error is None and isinstance(interruption, KeyboardInterrupt):
+            raise interruption
+
+    def close(self) -> None:
+        """Leave folders and signals as they were."""
+        os.close(self._folder)
+        if self._program_folder >= 0:
+            os.close(self._program_folder)
+        if _is_main() and signal.getsignal(signal.SIGINT) == self._on_interrupt:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _handle_interrupts(self) -> None:
+        if _is_main() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, self._on_interrupt)
+
+    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
+        if not self._is_inside or self._loop.interruption is not None:
             signal.default_int_handler(number, frame)
         self._loop.interruption = KeyboardInterrupt()
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if self._is_installed:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        interruption, self._loop.interruption = self._loop.interruption, None
-        if kind is None and isinstance(interruption, KeyboardInterrupt):
-            raise interruption
+
+def _is_main() -> bool:
+    return threading.current_thread() is threading.main_thread()
 
 
 class _Watchdog:
@@ -481,10 +545,12 @@ class _Watchdog:
         self._lock = threading.Lock()
         self.hang = ""
 
-    def __enter__(self) -> None:
+    def begin(self) -> None:
+        """Watch from now on."""
         threading.Thread(target=self._watch, name="neuros-watchdog", daemon=True).start()
 
-    def __exit__(self, *_error: object) -> None:
+    def end(self) -> None:
+        """Watch no more. Raises what it has set for this thread and has not come yet."""
         with self._lock:
             self._is_over.set()
         for _ in range(_CHECKS if self.hang else 0):
@@ -500,5 +566,5 @@ class _Watchdog:
             if not self._is_over.is_set():
                 self.hang = self._describe(self._thread_id)
                 ctypes.pythonapi.PyThreadState_SetAsyncExc(
-                    ctypes.c_ulong(self._thread_id), ctypes.py_object(_DidNotReturn)
+                    ctypes.c_ulong(self._thread_id), ctypes.py_object(StepTimeout)
                 )
