@@ -87,10 +87,18 @@ class SessionOptions(StartOptions):
         help="inputs that the session feeds in the place of their connections: robot.wheels",
     )
 
-    @property
-    def needs_processes(self) -> bool:
-        """Whether something is asked for that the nodes of a program's own thread do not have."""
-        return bool(self.recording or self.monitor_system_load or self.deployment or self.isolate)
+    def __post_init__(self) -> None:
+        asked = self.backend
+        super().__post_init__()
+        needs = ("record", "topics", "monitor_system_load", "deployment", "isolate")
+        given = [name for name in needs if getattr(self, name)]
+        if self.backend == LOCAL and given:
+            if asked == LOCAL:
+                raise UsageError(
+                    f"backend='local' with {', '.join(given)}: that needs a run in processes of its"
+                    " own, such as backend='in-process'"
+                )
+            object.__setattr__(self, "backend", AUTO)
 
 
 class Project:
@@ -237,23 +245,25 @@ class Project:
         from neuros.api.session import Session
         from neuros.api.session_link import Held, HeldRun, LaunchedRun, with_session_inputs
 
-        is_local = options.backend == LOCAL and not options.needs_processes
+        if options.expose and options.backend != LOCAL:
+            raise UsageError(
+                f"expose: ROS tools see the topics of the back end {options.backend} anyway"
+            )
         count = itertools.count(1)
 
         def start(seed: int | None, settings: Mapping[str, Any]) -> Held:
             number, output = next(count), None
             if options.output is not None:  # out, out-2, out-3
                 output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
-            backend = AUTO if options.backend == LOCAL else options.backend
             chosen = options.set
             if isinstance(chosen, Mapping):
                 chosen = with_model_fields(self._loaded.project, chosen)
             given = [*override_texts(chosen), *override_texts(settings)]
-            own = replace(options, seed=seed, output=output, set=given, backend=backend)
+            own = replace(options, seed=seed, output=output, set=given)
             project, messages = self._load_for_run(own)
             held, inputs = with_session_inputs(project, options.take_over)
             run: HeldRun
-            if is_local:
+            if options.backend == LOCAL:
                 in_process = replace(own, backend=IN_PROCESS)
                 plan = replace(make_plan(held, messages, in_process), request=own)
                 make_environments(plan.pythons, messages, sys.stderr)

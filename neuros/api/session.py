@@ -27,7 +27,14 @@ import numpy as np
 from neuros.api.loading import seed_variables, with_model_fields
 from neuros.api.run import Run
 from neuros.api.run_record import run_table
-from neuros.api.session_link import Held, connections_to, declared_at, port_of
+from neuros.api.session_link import (
+    PROGRAM_FAILED,
+    Held,
+    connections_to,
+    declared_at,
+    port_of,
+    why_it_ended,
+)
 from neuros.control import AtRest, NodeStatus
 from neuros.errors import NeurosError, RunError, UsageError
 from neuros.node.instruments import MOST_PACKETS
@@ -39,7 +46,6 @@ _READ_S = 1.0
 _MOST_ROUNDS_AT_REST = 1000
 _FINE = 1e-9
 _MOST_VARIATION = 2.0
-_PROGRAM_FAILED = 1
 
 
 class Session:
@@ -79,7 +85,7 @@ class Session:
         try:
             self._take(held.run.begin(self._known))
         except BaseException:
-            held.run.interrupt("the session could not begin", _PROGRAM_FAILED)
+            held.run.interrupt("the session could not begin", PROGRAM_FAILED)
             raise
 
     def _begin_anew(self) -> None:
@@ -410,12 +416,14 @@ class Session:
             if received is None:
                 received = self._outputs[output] = _Received()
                 self._known[output] = 0
+                if self._run is not None:
+                    self._take_last(output, received)
                 end_s = None
                 if self._held.is_behind and wait_s is not None:
                     end_s = time.monotonic() + wait_s
                 try:
-                    self._check_running()
-                    self._advance(0, end_s)
+                    if self._run is None:
+                        self._advance(0, end_s)
                 except BaseException:
                     del self._outputs[output], self._known[output]
                     raise
@@ -426,6 +434,14 @@ class Session:
 
     def _end(self) -> None:
         self._run = self._held.wait()
+        for name, received in self._outputs.items():
+            self._take_last(name, received)
+
+    def _take_last(self, name: str, received: _Received) -> None:
+        """Keep the packets that came after the last answer."""
+        count, contents = self._held.last_packets(name)
+        if count > received.count:
+            received.add(count, contents[received.count - count :])
 
     def _check_running(self) -> None:
         if self._run is not None:
@@ -632,10 +648,3 @@ def check_seconds(**named: Any) -> float:
     except (TypeError, ValueError):
         pass
     raise UsageError(f"{name}={seconds!r}: give 0 or more seconds")
-
-
-def why_it_ended(error: BaseException) -> tuple[str, int]:
-    """The reason and the exit code of a run whose program fails."""
-    if isinstance(error, KeyboardInterrupt):
-        return "ended by Ctrl+C", 130
-    return f"the program failed: {type(error).__name__}: {error}", _PROGRAM_FAILED

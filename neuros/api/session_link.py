@@ -33,14 +33,17 @@ from neuros.control import (
     WasReset,
     Watch,
 )
-from neuros.control.link import Arrivals, ControlLink
-from neuros.errors import UsageError
+from neuros.control.link import Arrivals, ControlLink, decode, decoder_of
+from neuros.errors import ControlError, UsageError
+from neuros.node.node import LAST_PACKETS
 from neuros.project.model import Node, Port, Project
 from neuros.project.names import SESSION
-from neuros.project.scanner import display_name, place_of
+from neuros.project.scanner import display_name, place_of, read_bytes
 from neuros.project.suggest import did_you_mean
 from neuros.transport.messages import RosPackets
 
+PROGRAM_FAILED = 1
+"""The exit code of a run whose program has failed."""
 _CONNECT_S = 0.01
 _MOST_UNSENT = 64
 _Answer = TypeVar("_Answer")
@@ -115,6 +118,9 @@ class HeldRun(Protocol):
 
     def wait(self) -> Run:
         """Wait for the end of the run."""
+
+    def last_packets(self, output: str) -> tuple[int, Sequence[Any]]:
+        """Of an output, after the end: the number of the newest packet, and the last ones."""
 
 
 @dataclass(frozen=True)
@@ -233,6 +239,14 @@ class LaunchedRun:
             if self._link is not None:
                 self._link.close()
         return self._run
+
+    def last_packets(self, output: str) -> tuple[int, Sequence[Any]]:
+        file = self.folder / output.partition(".")[0] / LAST_PACKETS
+        with contextlib.suppress(OSError, ControlError):  # the node was killed
+            last = decode(read_bytes(file), decoder_of((AtRest,)), str(file))
+            if isinstance(last, AtRest) and output in last.packets:
+                return last.packets[output]
+        return 0, ()
 
     def _after(self, ask: Callable[[SessionLink], _Answer | None]) -> _Answer | None:
         """The answer to a question; ``None`` if the run has ended."""
@@ -509,3 +523,10 @@ def declared_at(node: Node) -> str:
     """Where a node is declared, for messages."""
     line, column = place_of(node.file, node.pointer)
     return f"node '{node.name}' is declared in {display_name(node.file)}:{line}:{column}"
+
+
+def why_it_ended(error: BaseException) -> tuple[str, int]:
+    """The reason and the exit code of a run whose program fails."""
+    if isinstance(error, KeyboardInterrupt):
+        return "ended by Ctrl+C", 130
+    return f"the program failed: {type(error).__name__}: {error}", PROGRAM_FAILED

@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neuros.control import Finalising, Message, Progress, Ready, Shutdown
+from neuros.control import AtRest, Finalising, Message, Progress, Ready, Shutdown
+from neuros.control.link import to_bytes
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
@@ -28,6 +30,10 @@ from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
 from neuros.ports import Middleware, PacketRecorder, Transport, Way
 from neuros.project.model import Connection, NodeFile, Port
+
+LAST_PACKETS = "last_packets"
+"""In the folder of a node of a session: its newest packets, when the run has ended."""
+_MOST_SAVED_BYTES = 1_000_000
 
 
 class NodeRuntime:
@@ -115,7 +121,7 @@ class NodeRuntime:
                 recorder, middleware.packets.encode, lambda: self._time.now_s, self._logger
             )
             instruments.append(self._recorder)
-        self._is_held = is_held
+        self._is_held, self._is_local = is_held, is_local
         packets = middleware.packets
         copy_of = (lambda port: packets.copier(port.type)) if is_local else None
         self.histories = PacketHistories(packets.encode, copy_of)
@@ -283,6 +289,8 @@ class NodeRuntime:
         if runs_hooks and self.engine is not None:
             self._finalise_hooks(lambda name: self._tell(Finalising(self.name, name)))
         self._tell(Finalising(self.name, ""))
+        if self._is_held and not self._is_local:
+            self._save_packets()
         if self._recorder is not None:
             self._recorder.close()
         self._services.close()
@@ -373,6 +381,15 @@ class NodeRuntime:
             self.engine.pause()
         self._time.clock = self.engine.sim_clock
         return self.engine
+
+    def _save_packets(self) -> None:
+        """Leave the newest packets for a session, which may want to see what led to the end."""
+        packets = {
+            f"{self.name}.{output}": (history.count, history.newest(_MOST_SAVED_BYTES))
+            for output, history in self.histories.by_output.items()
+        }
+        with suppress(OSError):  # a full disk is reported by what loses more by it
+            (self.run_dir / LAST_PACKETS).write_bytes(to_bytes(AtRest(0, {}, packets)))
 
     def _finalise_hooks(self, begin: Callable[[str], object] = lambda _: None) -> None:
         for spec in self.specs:

@@ -527,20 +527,21 @@ def test_a_notebook_shows_the_graph_and_the_hooks(held: Session) -> None:
     assert "<td>decide</td>" in shown
 
 
-def test_a_step_that_takes_too_long_is_waited_for_by_the_next(held: Session) -> None:
-    children = psutil.Process().children(recursive=True)
-    nodes = [each for each in children if str(held.folder) in " ".join(each.cmdline())]
-    before = held["robot.pose"].count
-    for node in nodes:
-        node.suspend()
-    try:
-        with pytest.raises(TimeoutError, match="has not come to rest in time"):
-            held.step(timeout_s=0.1)
-    finally:
+def test_a_step_that_takes_too_long_is_waited_for_by_the_next(tmp_path: Path) -> None:
+    with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
+        children = psutil.Process().children(recursive=True)
+        nodes = [each for each in children if str(s.folder) in " ".join(each.cmdline())]
+        before = s["robot.pose"].count
         for node in nodes:
-            node.resume()
-    held.step(timeout_s=DEADLINE_S)
-    assert held["robot.pose"].count == before + 2
+            node.suspend()
+        try:
+            with pytest.raises(TimeoutError, match="has not come to rest in time"):
+                s.step(timeout_s=0.1)
+        finally:
+            for node in nodes:
+                node.resume()
+        s.step(timeout_s=DEADLINE_S)
+        assert s["robot.pose"].count == before + 2
 
 
 def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_from_being_heard(
@@ -751,6 +752,14 @@ def test_wrong_values_are_refused_as_those_of_a_hook(held: Session) -> None:
         (lambda s: s.step(sim_s=float("nan")), "sim_s=nan: give 0 or more seconds"),
         (lambda s: s.run(duration_s=-1), "duration_s=-1: give 0 or more seconds"),
         (lambda s: s.run(duration_sim_s=float("inf")), "duration_sim_s=inf: give 0 or more"),
+        (lambda s: s.step(3, sim_s=0.1), "rounds and sim_s are lengths of one step: give one"),
+        (lambda s: s.step(until=bool, sim_s=1), "sim_s and until are lengths of one step"),
+        (lambda s: s.step(2.5), "rounds=2.5: give a whole number"),
+        (lambda s: s.step("2"), "rounds='2': give a whole number"),
+        (lambda s: s.step(True), "rounds=True: give 0 or more"),
+        (lambda s: s.step(until=True), "until=True: give a function that takes the session"),
+        (lambda s: s.step(sim_s="1"), "sim_s='1': give 0 or more seconds"),
+        (lambda s: s["robot"], "'robot' is a node: name one of its outputs, which are robot.pose"),
     ],
 )
 def test_a_length_that_is_none_is_refused(
