@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from neuros.api.loading import (
     foreseen_failures,
     load_with_messages,
     model_problems,
+    override_texts,
     seed_variables,
     with_model_fields,
 )
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from neuros.api.session import Session
 
 LOCAL, IN_PROCESS = "local", "in-process"
-_ENVIRONMENT = "environment"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,30 +251,35 @@ class Project:
             )
         count = itertools.count(1)
 
-        def start(seed: int | None, settings: Mapping[str, Any]) -> Held:
-            number, output = next(count), None
-            if options.output is not None:  # out, out-2, out-3
-                output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
-            chosen = options.set
-            if isinstance(chosen, Mapping):
-                chosen = with_model_fields(self._loaded.project, chosen)
-            given = [*override_texts(chosen), *override_texts(settings)]
-            own = replace(options, seed=seed, output=output, set=given)
-            project, messages = self._load_for_run(own)
+        def prepare(seed: int | None, settings: Mapping[str, Any]) -> Callable[[], Held]:
+            wanted = options.set
+            if isinstance(wanted, Mapping):
+                wanted = with_model_fields(self._loaded.project, wanted)
+            given = [*override_texts(wanted), *override_texts(settings)]
+            chosen = replace(options, seed=seed, set=given)
+            project, messages = self._load_for_run(chosen)
             held, inputs = with_session_inputs(project, options.take_over)
-            run: HeldRun
-            if options.backend == LOCAL:
-                in_process = replace(own, backend=IN_PROCESS)
-                plan = replace(make_plan(held, messages, in_process), request=own)
-                make_environments(plan.pythons, messages, sys.stderr)
-                run = LocalRun(plan, messages.paths, exposes=options.expose)
-            else:
-                live = self._live(held, messages, own, is_held=True)
-                live.begin()
-                run = LaunchedRun(live, len(project.nodes))
-            return Held(run, project, frozenset(inputs), messages.paths)
 
-        return Session(start, options.seed)
+            def start() -> Held:
+                number, output = next(count), None
+                if options.output is not None:  # out, out-2, out-3
+                    output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
+                own = replace(chosen, output=output)
+                run: HeldRun
+                if options.backend == LOCAL:
+                    plan = make_plan(held, messages, replace(own, backend=IN_PROCESS))
+                    make_environments(plan.pythons, messages, sys.stderr)
+                    plan = replace(plan, request=own)
+                    run = LocalRun(plan, messages.paths, exposes=options.expose)
+                else:
+                    live = self._live(held, messages, own, is_held=True)
+                    live.begin()
+                    run = LaunchedRun(live, len(project.nodes))
+                return Held(run, project, frozenset(inputs), messages.paths)
+
+            return start
+
+        return Session(prepare, options.seed)
 
     def __reduce__(self) -> tuple[type[Project], tuple[Path, dict[str, Any]]]:
         """Pickle the path: the files are read again."""
@@ -318,7 +323,7 @@ class Project:
         loaded, messages = load_with_messages(self._path, texts, *names)
         if options.seed is not None:
             texts += [
-                f"nodes.{node}.{_ENVIRONMENT}.{name}={value}"
+                f"nodes.{node}.environment.{name}={value}"
                 for node, variables in seed_variables(loaded.project, options.seed).items()
                 for name, value in variables.items()
             ]
@@ -328,26 +333,3 @@ class Project:
                 self._warned.add(warning)
                 warnings.warn(str(warning), stacklevel=3)
         return loaded.project, messages
-
-
-def override_texts(settings: Mapping[str, Any] | Sequence[str] | None) -> tuple[str, ...]:
-    """Settings as texts of ``--set``: ``["nodes.a.environment.RATE=0.5"]``."""
-    if not isinstance(settings, Mapping):
-        return tuple(settings or ())
-    return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
-
-
-def value_text(path: str, value: Any) -> str:
-    """A value as text for ``--set``; ``None``, which removes the key, is empty.
-
-    Raises:
-        UsageError: if JSON has no such value.
-    """
-    if value is None:
-        return ""
-    if isinstance(value, str) and path.split(".")[2:3] == [_ENVIRONMENT]:
-        return value
-    try:
-        return json.dumps(value.tolist() if hasattr(value, "tolist") else value)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{path}: {error}") from error

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from neuros.api.loading import seed_variables, with_model_fields
+from neuros.api.loading import seed_variables, value_text, with_model_fields
 from neuros.api.run import Run
 from neuros.api.run_record import run_table
 from neuros.api.session_link import (
@@ -66,13 +66,17 @@ class Session:
         runs: those that a reset has ended; each has a folder of its own.
     """
 
-    def __init__(self, start: Callable[[int | None, Mapping[str, Any]], Held], seed: int | None):
-        self._start = start
+    def __init__(
+        self,
+        prepare: Callable[[int | None, Mapping[str, Any]], Callable[[], Held]],
+        seed: int | None,
+    ) -> None:
+        self._prepare = prepare
         self._seed = seed
         self._lock = threading.RLock()
         self._outputs: dict[str, _Received] = {}
         self.runs: list[Run] = []
-        self._hold(start(seed, {}))
+        self._hold(prepare(seed, {})())
 
     def _hold(self, held: Held) -> None:
         """Take a run that has just been started."""
@@ -195,23 +199,25 @@ class Session:
             seed = self._seed if seed is None else seed
             settings = with_model_fields(self._project, set or {})
             if not self._reset_in_place(seed, settings):
+                start = self._prepare(seed, settings)  # what is wrong ends no run
                 self.runs.append(self.close("the session was reset"))
-                self._hold(self._start(seed, settings))
+                self._hold(start())
             self._seed = seed
 
     def _reset_in_place(self, seed: int | None, settings: Mapping[str, Any]) -> bool:
         """Whether the nodes could be reset in their process."""
         variables = {} if seed is None else seed_variables(self._project, seed)
-        changed: dict[str, dict[str, str]] = {name: {**own} for name, own in variables.items()}
+        names = [node.name for node in self._project.nodes]
         for path, value in settings.items():
             kind, _, rest = path.partition(".")
             node, _, rest = rest.partition(".")
             place, _, variable = rest.partition(".")
-            if kind != "nodes" or place != "environment" or not variable or value is None:
+            is_variable = kind == "nodes" and node in names and place == "environment"
+            if not (is_variable and variable) or value is None:
                 return False
-            changed.setdefault(self._project.node(node).name, {})[variable] = str(value)
+            variables.setdefault(node, {})[variable] = value_text(path, value)
         try:
-            if self._run is not None or not self._held.reset(changed):
+            if self._run is not None or not self._held.reset(variables):
                 return False
         except RunError:
             return False
