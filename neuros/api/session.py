@@ -232,7 +232,7 @@ class Session:
         node, port = port_of(self._project, output, is_input=False)
         return SessionOutput(self, f"{node.name}.{port.name}", port)
 
-    def probe(self, output: str, *, every: int = 1) -> Probe:
+    def probe(self, output: str, *, every: int = 1) -> PacketProbe:
         """Keep the packets of an output from now on, over resets, too.
 
         Args:
@@ -242,7 +242,7 @@ class Session:
             raise UsageError(f"every={every}: give 1 or more packets")
         found = self[output]
         with self._lock:
-            probe = Probe(found.name, found._port, every)
+            probe = PacketProbe(found.name, found._port, every)
             self._received(found.name)._probes.append((probe, partial(self._copy, found._port)))
         return probe
 
@@ -360,7 +360,7 @@ class Session:
     def _run_sim(self, duration_s: float) -> bool:
         """Grant many rounds at once, but none that is to begin after the end.
 
-        In one process the nodes know the end, too. Elsewhere a round is taken to gain twice as much
+        In one thread the nodes know the end, too. Elsewhere a round is taken to gain twice as much
         as the largest average so far, so a grant covers half of what is left, or less. Where rounds
         suddenly gain several times as much, some may begin after it.
         """
@@ -474,7 +474,7 @@ class _Received:
     """
 
     def __init__(self) -> None:
-        self._probes: list[tuple[Probe, Callable[[Any], Any]]] = []
+        self._probes: list[tuple[PacketProbe, Callable[[Any], Any]]] = []
         self.begin_anew()
 
     def begin_anew(self) -> None:
@@ -573,7 +573,7 @@ class SessionOutput:
         return f"<{self.name}: {count} packets of {self._port.type}>"
 
 
-class Probe:
+class PacketProbe:
     """The packets of an output since :meth:`Session.probe`, oldest first.
 
     Attributes:
@@ -615,7 +615,7 @@ class Probe:
             self._count += 1
 
     def __repr__(self) -> str:
-        return f"<Probe of {self.name}: {len(self)} packets of {self._type}>"
+        return f"<PacketProbe of {self.name}: {len(self)} packets of {self._type}>"
 
 
 def check_length(

@@ -317,27 +317,21 @@ class NodeRuntime:
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
 
     def deliver(self, input_name: str, data: bytes) -> None:
-        """A session sends a packet to one of its inputs.
-
-        Raises:
-            ControlError: if it is none of them.
-            ProtocolError: if the bytes are no message of its type.
-        """
-        port = next((p for p in self.file.node.inputs if p.name == input_name), None)
-        if port is None or port.external_topic is None:
-            raise ControlError(f"a packet came for '{self.name}.{input_name}', no session's input")
-        self.on_external_packet(port, self._middleware.packets.decode(port.type, data))
-
-    def deliver_if_right(self, input_name: str, data: bytes) -> None:
         """An observer sends a packet to an input of the session.
 
         What is none is refused in the log: an observer ends no run by a mistake.
         """
         try:
-            self.deliver(input_name, data)
+            port = next((p for p in self.file.node.inputs if p.name == input_name), None)
+            if port is None or port.external_topic is None:
+                text = f"a packet came for '{self.name}.{input_name}', no session's input"
+                raise ControlError(text)
+            packet = self._middleware.packets.decode(port.type, data)
         except (ControlError, ProtocolError, ValueError) as error:
             self._enter()  # the log is that of its own
             self._logger.warning(f"a packet for input '{input_name}' is refused: {error}")
+        else:
+            self.on_external_packet(port, packet)
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """The receiver of a connection has started on packets."""
