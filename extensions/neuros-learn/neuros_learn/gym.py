@@ -81,7 +81,11 @@ def make(
 
     Args:
         max_episode_steps: the number of steps after which an episode is ``truncated``.
+
+    Raises:
+        UsageError: that number is not a whole one from 1 on; or as the class.
     """
+    _check_steps(max_episode_steps)
     _check_names(arguments)
     loaded = project if isinstance(project, Project) else Project.from_file(project)
     name = re.sub(r"[^\w.-]", "_", loaded.name)
@@ -106,9 +110,10 @@ def register(
         project, max_episode_steps, arguments: as of :func:`make`.
 
     Raises:
-        UsageError: there is no argument of a name.
+        UsageError: there is no argument of a name, or the number of steps is none.
         gymnasium.error.Error: the name is not one of Gymnasium.
     """
+    _check_steps(max_episode_steps)
     _check_names(arguments)
     # An environment may be made from another folder, or in another process.
     found = project if isinstance(project, Project) else os.path.abspath(project)
@@ -433,6 +438,12 @@ _CONVERT: Mapping[Sort, Callable[[Any], list[Any]]] = {
     Sort.FLOAT: lambda numbers: numbers.astype(float).tolist(),
 }
 """Converters from an array of numbers to values of a field."""
+
+
+def _check_steps(number: Any) -> None:
+    """Gymnasium would complain when the session has started. Raises ``UsageError``."""
+    if number is not None and (not isinstance(number, int) or number < 1):
+        raise UsageError(f"max_episode_steps={number!r}: give a whole number from 1 on")
 
 
 def _check_names(arguments: Iterable[str]) -> None:
