@@ -114,6 +114,7 @@ def times_of_neuros(steps: int) -> dict[str, float]:
             reward=lambda: 0.0,
             model=MODEL.name,
             output=folder / "run",
+            backend="in-process",
         )
         return times(make, steps)
 

@@ -147,7 +147,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         ranges: lowest and highest value by name: numbers, or arrays.
         model: MJCF file, relative to the project file, with the ranges of the actuators that an
             action drives; ``ranges`` come first.
-        rounds, sim_s: length of a step, as for :meth:`Session.step`.
+        rounds, sim_s: length of a step, as for :meth:`Session.step`: one of them, or neither.
         initial_action: sent at each reset, for a project that waits for its first command.
         render_mode: ``"rgb_array"``, or ``None``: pictures are not asked for.
         render: the output that sends the pictures; it may be left out if only one sends images.
@@ -179,16 +179,16 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         info: Callable[..., Mapping[str, Any]] = lambda: _NOTHING,
         ranges: Mapping[str, tuple[Any, Any]] | None = None,
         model: str | os.PathLike[str] | None = None,
-        rounds: int = 1,
+        rounds: int | None = None,
         sim_s: float | None = None,
         initial_action: Any = None,
         render_mode: str | None = None,
         render: str | None = None,
-        backend: str = "in-process",
+        backend: str = "local",
         **options: Any,
     ) -> None:
         _check_names(options)
-        check_length(rounds, sim_s)
+        count = check_length(rounds, sim_s)
         self._reward, self._done, self._truncated, self._info = (
             _by_names(role, function)
             for role, function in (
@@ -204,7 +204,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         self.render_mode = render_mode
         self.metadata = {"render_modes": []}
         if self._camera is not None:
-            fps = _steps_per_s(described, rounds, sim_s)
+            fps = _steps_per_s(described, count, sim_s)
             self.metadata = {"render_modes": [_RENDER_MODE], "render_fps": fps}
         self._rounds, self._sim_s, self._initial_action = rounds, sim_s, initial_action
         self._has_seeds = bool(seeds(described.nodes))

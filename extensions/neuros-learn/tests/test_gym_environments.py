@@ -23,7 +23,6 @@ from std_msgs.msg import Float64
 
 import neuros
 import neuros.gym
-from neuros.api.session import Session
 from neuros.errors import ProjectError, UsageError
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -248,7 +247,9 @@ def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
         ({"ranges": {"robot.flag": (0, 300)}, "action": "robot.flag"}, "range of robot.flag: "),
         ({"model": "nothing.xml"}, "nothing.xml"),
         ({"rendermode": "rgb_array"}, r"neuros\.gym\.make has no .*did you mean 'render_mode'\?"),
-        ({"duratoin": 3}, r"no argument 'duratoin' \(did you mean 'duration'\?\)"),
+        ({"ouput": "run"}, r"no argument 'ouput' \(did you mean 'output'\?\)"),
+        ({"rounds": 1, "sim_s": 0.1}, "rounds and sim_s are lengths of one step: give one of them"),
+        ({"rounds": 1.5}, "rounds=1.5: give a whole number"),
         ({"take_over": "robot.flag"}, "no argument 'take_over'"),
         ({"max_episode_steps": 0}, "max_episode_steps=0: give a whole number from 1 on"),
         ({"max_episode_steps": 2.5}, "max_episode_steps=2.5: give a whole number"),
@@ -347,22 +348,21 @@ class TestOptionsOfAReset:
         assert env.unwrapped.np_random.bit_generator.state == random
         assert episode(env, 7) == before
 
-    def test_settings_are_those_of_the_reset_of_the_session(
-        self, env: gymnasium.Env[Any, Any], monkeypatch: pytest.MonkeyPatch
+    def test_settings_hold_until_the_next_reset(self, env: gymnasium.Env[Any, Any]) -> None:
+        def speed(options: dict[str, Any] | None) -> float:
+            env.reset(seed=7, options=options)
+            return float(env.step(np.array([1.0]))[0][VELOCITY][0])
+
+        usual = speed(None)
+        slack = speed({"set": {"cart.model.actuator_gear": 0.0}})
+        assert usual > slack + 0.1
+        assert [speed(options) for options in (None, {}, {"set": None}, {"set": {}})] == 4 * [usual]
+
+    def test_a_setting_of_a_node_that_there_is_not_is_refused(
+        self, env: gymnasium.Env[Any, Any]
     ) -> None:
-        given: list[dict[str, Any]] = []
-        own = Session.reset
-
-        def reset(session: Session, **arguments: Any) -> None:
-            given.append(arguments)
-            own(session, seed=arguments["seed"])
-
-        monkeypatch.setattr(Session, "reset", reset)
-        settings = {"nodes.cart.environment.MASS": 2}
-        for options in (None, {}, {"set": None}, {"set": settings}):
-            env.reset(seed=1, options=options)
-        assert [each.get("set") for each in given] == [None, None, None, settings]
-        assert ["set" in each for each in given] == [False, False, False, True]
+        with pytest.raises(UsageError, match=r"no node 'card' \(did you mean 'cart'\?\)"):
+            env.reset(options={"set": {"card.model.actuator_gear": 0.0}})
 
 
 class TestRegistration:
