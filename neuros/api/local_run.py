@@ -46,6 +46,7 @@ _DRAIN_S = 5.0
 _REPORT_S = 1.0
 _CELL_S = 0.02
 _CHECKS = 100
+_WATCHDOG = "neuros-watchdog"
 _GRACE_S = 1.0
 """How much longer than its time-out a step may take until the hook that runs is interrupted."""
 
@@ -76,7 +77,9 @@ class LocalRun:
         self._started_s = time.monotonic()
         self._run_id = os.urandom(8).hex()
         self._git = GitState(project.folder)
-        self.folder = make_run_folder(request.output, project.name)
+        with _Thread.turn:  # else the current folder and the environment may be those of nodes
+            self.folder = make_run_folder(request.output, project.name)
+            self._contexts = ContextSwitch()
         self._files = write_node_files(plan, self.folder)
         self._outcome = Outcome()
         self._declarations = Declarations(self._files)
@@ -94,7 +97,6 @@ class LocalRun:
         self._middleware = LocalMiddleware(
             self._loop, self._write, self._fail_in_callback, exposes=exposes, digest=digest
         )
-        self._contexts = ContextSwitch()
         self._contexts.hide_from_nodes(project.folder)
         self._nodes: dict[str, NodeRuntime] = {}
         self._thread = _Thread(
@@ -162,6 +164,7 @@ class LocalRun:
         began_s = time.monotonic()
         with self._inside():
             self._deliver_sent()
+            self._is_behind = True
             for node in self._nodes.values():
                 node.resume()
             try:
@@ -192,7 +195,8 @@ class LocalRun:
     def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
         """Bring all nodes back to their start, if they can be; see :meth:`HeldRun.reset`."""
         nodes = self._nodes.values()
-        if self._run is not None or any(node.why_not_reset for node in nodes):
+        is_fixed = self._thread.has_threads or any(node.why_not_reset for node in nodes)
+        if self._run is not None or is_fixed:
             return False
         with self._inside():
             self._sent.clear()
@@ -214,6 +218,7 @@ class LocalRun:
 
     def stop(self, reason: str) -> None:
         """End the run, drained."""
+        self._thread.check_outside()
         self._end = self._end or (reason, _DRAIN_S, "")
         self._finish()
 
@@ -455,7 +460,10 @@ class LocalRun:
             sys.stdout.write(f"\n{run_table(record)}\n\n{outcome.reason}\n")
 
     def _end_with_program(self) -> None:
-        self.interrupt("the program ended before it closed the session", EXIT_CODES[signal.SIGINT])
+        if _Thread.turn.acquire(timeout=_GRACE_S):  # else a hook runs for ever in another thread
+            self.interrupt(
+                "the program ended before it closed the session", EXIT_CODES[signal.SIGINT]
+            )
 
 
 class StepTimeout(BaseException):
@@ -468,15 +476,23 @@ class StepTimeout(BaseException):
 class _Thread:
     """The thread of the program while nodes run in it.
 
-    Their folder is the current one then. Ctrl+C waits for the hook that runs; a second one does
-    not.
+    Folder, environment, modules and signals belong to the process, so nodes of one session have
+    them at a time; those of a session in another thread wait. Their folder is the current one then.
+    Ctrl+C waits for the hook that runs; a second one does not.
 
     Args:
         folder: the run folder.
         leave: gives the process its own environment and modules back.
         describe_hang: where the thread of this number stands.
         on_hang: called outside, after a hook that did not return has been interrupted.
+
+    Attributes:
+        turn: held by the thread in which nodes run.
     """
+
+    turn = threading.RLock()
+    _open = 0  # sessions
+    _interruptible: ClassVar[LocalLoop | None] = None  # while nodes run in the main thread
 
     def __init__(
         self,
@@ -494,26 +510,50 @@ class _Thread:
         self._on_hang = on_hang
         self._watchdog: _Watchdog | None = None
         self._is_inside = False
+        self._outer: LocalLoop | None = None
         self._left_s = -math.inf
+        self._others = {*threading.enumerate()}
+        self._begun: set[threading.Thread] = set()
+        self._threads = 0
+        with self.turn:
+            _Thread._open += 1
+
+    @property
+    def has_threads(self) -> bool:
+        """Whether a thread goes on that nodes have begun."""
+        return any(thread.is_alive() for thread in self._begun)
+
+    def check_outside(self) -> None:
+        """Raise ``UsageError`` in a hook: a hook cannot use the session that runs it."""
+        if self._is_inside:
+            raise UsageError(
+                "a hook of this session runs: it cannot step, reset or close the session, or look"
+                " at it"
+            )
 
     def until(self, end_s: float | None) -> _Thread:
         """Interrupt at a time (monotonic, seconds)."""
+        self.check_outside()
         if end_s is not None:
             self._watchdog = _Watchdog(end_s, self._loop, self._describe_hang)
         return self
 
     def __enter__(self) -> None:
-        path = os.getcwd()
-        if path != self._program_path:
-            if self._program_folder >= 0:
-                os.close(self._program_folder)
-            self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
-            self._program_path = path
-        os.fchdir(self._folder)
-        # A notebook exchanges the handler with each cell, so it is looked at after a pause.
-        if time.monotonic() - self._left_s > _CELL_S:
-            self._handle_interrupts()
-        self._is_inside = True
+        self.turn.acquire()
+        try:
+            self._note_folder()
+            # A notebook exchanges the handler with each cell, so it is looked at after a pause.
+            if time.monotonic() - self._left_s > _CELL_S:
+                self._handle_interrupts()
+            self._is_inside = True
+            self._outer = _Thread._interruptible
+            _Thread._interruptible = self._outer or (self._loop if _is_main() else None)
+            os.fchdir(self._folder)
+        except BaseException:
+            self._is_inside = False
+            self.turn.release()
+            raise
+        self._threads = threading.active_count()
         if self._watchdog is not None:
             self._watchdog.begin()
 
@@ -528,9 +568,14 @@ class _Thread:
                 hang = watchdog.hang
         except StepTimeout:
             hang = watchdog.hang if watchdog is not None else ""
-        self._is_inside = False
+        if threading.active_count() > self._threads or self._left_s < 0:  # now, or while it loaded
+            threads = {*threading.enumerate()} - self._others
+            self._begun = {thread for thread in threads if thread.name != _WATCHDOG}
         self._leave()
         os.fchdir(self._program_folder)
+        # From here on, Ctrl+C is the program's again.
+        _Thread._interruptible, self._is_inside = self._outer, False
+        self.turn.release()
         self._left_s = time.monotonic()
         interruption, self._loop.interruption = self._loop.interruption, None
         if hang:
@@ -544,17 +589,33 @@ class _Thread:
         os.close(self._folder)
         if self._program_folder >= 0:
             os.close(self._program_folder)
-        if _is_main() and signal.getsignal(signal.SIGINT) == self._on_interrupt:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        with self.turn:
+            _Thread._open -= 1
+            if not _Thread._open and _is_main() and _handler() is _Thread._on_interrupt:
+                signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _note_folder(self) -> None:
+        try:
+            path = os.getcwd()
+        except FileNotFoundError:  # it has been removed
+            path = ""
+        if path != self._program_path or not path:
+            if self._program_folder >= 0:
+                os.close(self._program_folder)
+            self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
+            self._program_path = path
 
     def _handle_interrupts(self) -> None:
-        if _is_main() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, self._on_interrupt)
+        if _is_main() and _handler() is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _Thread._on_interrupt)
 
-    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
-        if not self._is_inside or self._loop.interruption is not None:
+    @staticmethod
+    def _on_interrupt(number: int, frame: FrameType | None) -> None:
+        loop = _Thread._interruptible
+        if loop is None or loop.interruption is not None:
             signal.default_int_handler(number, frame)
-        self._loop.interruption = KeyboardInterrupt()
+        else:
+            loop.interruption = KeyboardInterrupt()
 
 
 def _uses_nest(node: Node) -> bool:
@@ -562,6 +623,10 @@ def _uses_nest(node: Node) -> bool:
         return True
     plugin = read_plugin(node.plugin)
     return plugin is not None and any(n.name.partition(".")[0] == "nest" for n in plugin.needs)
+
+
+def _handler() -> object:
+    return signal.getsignal(signal.SIGINT)
 
 
 def _is_main() -> bool:
@@ -590,7 +655,7 @@ class _Watchdog:
 
     def begin(self) -> None:
         """Watch from now on."""
-        threading.Thread(target=self._watch, name="neuros-watchdog", daemon=True).start()
+        threading.Thread(target=self._watch, name=_WATCHDOG, daemon=True).start()
 
     def end(self) -> None:
         """Watch no more. Raises what it has set for this thread and has not come yet."""

@@ -149,7 +149,7 @@ class Session:
             for _ in self._rounds(count, sim_s, until):
                 if not self._advance(1, end_s):
                     return False
-        return True
+            return self.is_running  # `until` may have closed it
 
     async def astep(self, rounds: int | None = None, **options: Any) -> bool:
         """As :meth:`step`, for coroutines."""
@@ -221,6 +221,10 @@ class Session:
                 return False
         except RunError:
             return False
+        except KeyboardInterrupt as error:  # some nodes are reset, and others are not
+            self._held.interrupt(*why_it_ended(error))
+            self._end()
+            raise
         self._begin_anew()
         self._take(self._held.begin(self._known))
         return True

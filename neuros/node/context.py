@@ -117,8 +117,8 @@ class ContextSwitch:
         self._current = context
         self._set_variables(current, context)
         # Within os.environ itself, so that other references to it show these, too.
-        os.environ._data = context.environ  # type: ignore[attr-defined]
-        current.path, sys.path = sys.path, context.path
+        own, os.environ._data = os.environ._data, context.environ  # type: ignore[attr-defined]
+        current.environ, current.path, sys.path = own, sys.path, context.path
         modules.update(context.modules)
         self._known_modules = len(modules)
         if context.log_fd is not None:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import ModuleType
 
 import psutil
 import pytest
@@ -68,6 +71,81 @@ def work(node):
         signal.raise_signal(signal.SIGINT)  # Ctrl+C, in the midst of a hook
     return x
 """
+INTERRUPTS = """
+import os, signal
+from neuros.hooks import neuros_function, neuros_initialise
+
+def interrupt(node, when):
+    if os.environ.get("AT") == when:
+        signal.raise_signal(signal.SIGINT)
+
+@neuros_initialise()
+def begin(node):
+    interrupt(node, "start")
+
+@neuros_function(outputs="x")
+def work(node):
+    interrupt(node, "work")
+    return node.make_packet("x")
+"""
+USES_ITS_SESSION = """
+import used
+from neuros.hooks import neuros_function
+
+@neuros_function(outputs="x")
+def use(node):
+    used.by(node)
+    return node.make_packet("x")
+"""
+LOOKS_AT_ITS_PLACE = """
+import os, time
+from neuros.hooks import neuros_function
+
+@neuros_function(outputs="x")
+def look(node):
+    time.sleep(0)  # let other threads go on
+    assert os.getcwd() == str(node.run_dir.parent)
+    assert os.environ["NEUROS_RUN_DIR"] == str(node.run_dir)
+    return node.make_packet("x")
+"""
+SENDS_FROM_A_THREAD = """
+import threading
+from neuros.hooks import neuros_initialise, neuros_tick
+
+def send(node):
+    node.wait_until_active(lambda: False)
+    number = 0.0
+    while True:
+        x = node.make_packet("x")
+        x.data = number = number + 1.0
+        if not node.submit({"x": x}, lambda: False):
+            break
+
+@neuros_initialise()
+def begin(node):
+    threading.Thread(target=send, args=(node,)).start()
+
+@neuros_tick(3600.0)
+def look(node): ...
+"""
+HEARS_ITSELF = """
+from std_msgs.msg import Float64
+from neuros.hooks import neuros_function, neuros_initialise
+
+@neuros_initialise()
+def begin(node):
+    ros, heard = node.get_ros_node(), []
+    node.set_user_data((ros.create_publisher(Float64, "/own", 10), heard))
+    ros.create_subscription(Float64, "/own", heard.append, 10)
+
+@neuros_function(outputs="x")
+def say(node):
+    publisher, heard = node.get_user_data()
+    publisher.publish(Float64())
+    x = node.make_packet("x")
+    x.data = float(len(heard))
+    return x
+"""
 TALKER = """
 from std_msgs.msg import Float64
 from neuros.hooks import neuros_function, neuros_initialise
@@ -101,6 +179,26 @@ def project_of(folder: Path, plugin: str, **keys: object) -> neuros.Project:
     node.setdefault("outputs", [port("x")])
     (folder / "project.json").write_text(json.dumps({"nodes": [node]}))
     return neuros.Project.from_file(folder)
+
+
+@contextlib.contextmanager
+def using(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, use: Callable[[Session], object]
+) -> Iterator[Session]:
+    """A session whose hook is handed the session itself."""
+    used = ModuleType("used")
+    monkeypatch.setitem(sys.modules, "used", used)
+    with project_of(folder, USES_ITS_SESSION).session() as s:
+        used.by = lambda _: use(s)  # type: ignore[attr-defined]
+        yield s
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Python's own handler of Ctrl+C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture(autouse=True)
@@ -167,6 +265,65 @@ class TestTheProgram:
                 eyes = [s["thrower.eyes"].packet.data for s in (first, second)]
                 assert eyes[0] == eyes[1]
 
+    def test_the_current_folder_may_be_removed(self, tmp_path: Path) -> None:
+        project = project_of(tmp_path, LOOKS_AT_ITS_PLACE)
+        with project.session(output=tmp_path / "run") as s:
+            s.step()
+            gone = tmp_path / "gone"
+            gone.mkdir()
+            os.chdir(gone)
+            gone.rmdir()
+            s.step()
+            assert s["a.x"].count == 2
+            os.chdir(tmp_path)
+            s.step()
+            assert Path.cwd() == tmp_path
+
+    def test_sessions_in_threads_have_the_process_in_turn(self, tmp_path: Path) -> None:
+        project = project_of(tmp_path, LOOKS_AT_ITS_PLACE)
+
+        def run(_: int) -> int:
+            with project.session() as s:
+                for _ in range(20):
+                    s.step()
+                return s["a.x"].count
+
+        with ThreadPoolExecutor(3) as threads:
+            assert [*threads.map(run, range(6))] == [20] * 6
+        assert Path.cwd() == tmp_path
+        assert "NEUROS_RUN_DIR" not in os.environ
+        assert len([*(tmp_path / "runs").rglob("run.json")]) == 6
+
+    def test_a_hook_may_step_another_session(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "inner").mkdir()
+        with (
+            project_of(tmp_path / "inner", LOOKS_AT_ITS_PLACE).session() as inner,
+            using(tmp_path, monkeypatch, lambda _: inner.step()) as s,
+        ):
+            s.step(2)
+            assert inner["a.x"].count == 2
+        assert s.close().exit_code == 0
+
+    @pytest.mark.parametrize("call", ["step", "reset", "close"])
+    def test_a_hook_cannot_use_the_session_that_runs_it(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+    ) -> None:
+        with using(tmp_path, monkeypatch, lambda s: getattr(s, call)()) as s:
+            with pytest.raises(RunError, match=r"hook 'use': .*a hook of this session runs"):
+                s.step()
+            assert Path.cwd() == tmp_path
+        assert s.close().exit_code == 1
+
+    def test_until_may_reset_and_close_the_session(self, tmp_path: Path) -> None:
+        with project_of(tmp_path, LOOKS_AT_ITS_PLACE).session() as s:
+            s.step(3)
+            resets = iter([s.reset])
+            assert s.step(until=lambda s: next(resets, lambda: None)() or s["a.x"].count == 2)
+            assert s["a.x"].count == 2
+            assert not s.step(until=lambda s: s.close())
+
 
 class TestFailures:
     def test_the_error_of_a_hook_is_the_cause_of_that_of_the_step(self, tmp_path: Path) -> None:
@@ -190,18 +347,56 @@ class TestFailures:
                 s.step()
         assert s.close().exit_code == 1
 
-    def test_ctrl_c_waits_for_the_hook_and_the_program_may_go_on(self, tmp_path: Path) -> None:
-        before = signal.signal(signal.SIGINT, signal.default_int_handler)
-        try:
-            with project_of(tmp_path, INTERRUPTED).session() as s:
+    def test_ctrl_c_waits_for_the_hook_and_the_program_may_go_on(
+        self, tmp_path: Path, ctrl_c: None
+    ) -> None:
+        with project_of(tmp_path, INTERRUPTED).session() as s:
+            s.step()
+            with pytest.raises(KeyboardInterrupt):
                 s.step()
+            s.step()
+            assert [packet.data for packet in s["a.x"].packets] == [0.0, 1.0, 2.0]
+        assert s.close().exit_code == 0
+
+    def test_ctrl_c_waits_for_the_hook_of_each_session(self, tmp_path: Path, ctrl_c: None) -> None:
+        (tmp_path / "other").mkdir()
+        with (
+            project_of(tmp_path / "other", LOOKS_AT_ITS_PLACE).session() as other,
+            project_of(tmp_path, INTERRUPTS, environment={"AT": "work"}).session() as s,
+        ):
+            for between in (other.step, other.close):
+                between()
                 with pytest.raises(KeyboardInterrupt):
                     s.step()
+        assert s.close().exit_code == 0
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+    def test_ctrl_c_in_a_reset_ends_the_run_and_the_next_reset_begins_another(
+        self, tmp_path: Path, ctrl_c: None
+    ) -> None:
+        with project_of(tmp_path, INTERRUPTS, environment={"AT": ""}).session() as s:
+            s.step(5)
+            assert s["a.x"].count == 5
+            with pytest.raises(KeyboardInterrupt):
+                s.reset(set={"nodes.a.environment.AT": "start"})
+            with pytest.raises(RunError, match=r"ended by Ctrl\+C"):
                 s.step()
-                assert [packet.data for packet in s["a.x"].packets] == [0.0, 1.0, 2.0]
-            assert s.close().exit_code == 0
-        finally:
-            signal.signal(signal.SIGINT, before)
+            s.reset()
+            s.step(2)
+            assert s["a.x"].count == 2
+        assert [run.exit_code for run in s.runs] == [130]
+
+    def test_a_plugin_with_a_thread_takes_a_new_run_at_a_reset(self, tmp_path: Path) -> None:
+        project = project_of(tmp_path, SENDS_FROM_A_THREAD)
+        threads = threading.active_count()
+        with project.session() as s:
+            s.step(until=lambda s: s["a.x"].count >= 3)
+            s.reset()
+            s.step(until=lambda s: s["a.x"].count >= 3)
+            packets = [packet.data for packet in s["a.x"].packets]
+            assert packets == [*range(1, len(packets) + 1)]
+            assert len(s.runs) == 1
+        wait_until(lambda: threading.active_count() <= threads, DEADLINE_S)
 
     def test_what_a_program_of_its_own_thread_cannot_have_is_refused(self, tmp_path: Path) -> None:
         project = project_of(tmp_path, HANGS)
@@ -225,6 +420,15 @@ class TestRos:
                 return bool(heard) and s["a.x"].packet.data > 0
 
             wait_until(is_there, DEADLINE_S)
+
+    def test_ros_is_served_while_a_run_that_goes_freely_is_busy(self, tmp_path: Path) -> None:
+        with project_of(tmp_path, HEARS_ITSELF).session() as s:
+
+            def is_heard() -> bool:
+                s.run(duration_s=0.05)
+                return bool(s["a.x"].packet.data)
+
+            wait_until(is_heard, DEADLINE_S)
 
     def test_parameters_alone_need_no_ros(self, tmp_path: Path) -> None:
         with project_of(tmp_path, TALKER, parameters={"gain": 2.0}).session() as s:
