@@ -152,7 +152,9 @@ def with_model_fields(project: Project, settings: Mapping[str, Any]) -> dict[str
         if node == "nodes" or kind != "model" or not name:
             found[path] = value
         elif node in nodes:
-            fields.setdefault(node, {})[name] = getattr(value, "tolist", lambda v=value: v)()
+            before = nodes[node].environment.get(MODEL_FIELDS, "{}")  # of the session, perhaps
+            value = value.tolist() if hasattr(value, "tolist") else value
+            fields.setdefault(node, json.loads(before))[name] = value
         else:
             hint = did_you_mean(node, nodes) or f"it has {', '.join(nodes)}"
             raise UsageError(f"'{path}': {project.name} has no node '{node}' ({hint})")

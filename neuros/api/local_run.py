@@ -33,6 +33,7 @@ from neuros.node.failures import callback_error
 from neuros.node.node import NodeRuntime
 from neuros.node.reports import declared
 from neuros.options import recorded_values
+from neuros.project.loops import modules_beside
 from neuros.project.model import Node, NodeFile
 from neuros.project.plugin_files import read_plugin
 from neuros.recording.provenance import GitState, provenance
@@ -46,7 +47,6 @@ _DRAIN_S = 5.0
 _REPORT_S = 1.0
 _CELL_S = 0.02
 _CHECKS = 100
-_WATCHDOG = "neuros-watchdog"
 _GRACE_S = 1.0
 """How much longer than its time-out a step may take until the hook that runs is interrupted."""
 
@@ -286,6 +286,8 @@ class LocalRun:
             is_local=True,
         )
         node.load()
+        if _uses_nest(file.node):
+            self._contexts.claim("nest")
         self._declarations.take(declared(node.name, node.specs))
 
     def _activate(self) -> None:
@@ -512,9 +514,8 @@ class _Thread:
         self._is_inside = False
         self._outer: LocalLoop | None = None
         self._left_s = -math.inf
-        self._others = {*threading.enumerate()}
+        self._others: set[threading.Thread] = set()
         self._begun: set[threading.Thread] = set()
-        self._threads = 0
         with self.turn:
             _Thread._open += 1
 
@@ -553,7 +554,8 @@ class _Thread:
             self._is_inside = False
             self.turn.release()
             raise
-        self._threads = threading.active_count()
+        if threading.active_count() != len(self._others):
+            self._others = {*threading.enumerate()}
         if self._watchdog is not None:
             self._watchdog.begin()
 
@@ -568,9 +570,10 @@ class _Thread:
                 hang = watchdog.hang
         except StepTimeout:
             hang = watchdog.hang if watchdog is not None else ""
-        if threading.active_count() > self._threads or self._left_s < 0:  # now, or while it loaded
-            threads = {*threading.enumerate()} - self._others
-            self._begun = {thread for thread in threads if thread.name != _WATCHDOG}
+        # While nodes are loaded, the thread that asks git may end.
+        if threading.active_count() > len(self._others) or self._left_s < 0:
+            begun = self._begun | ({*threading.enumerate()} - self._others)
+            self._begun = {thread for thread in begun if thread.is_alive()}
         self._leave()
         os.fchdir(self._program_folder)
         # From here on, Ctrl+C is the program's again.
@@ -622,7 +625,8 @@ def _uses_nest(node: Node) -> bool:
     if node.container.partition(":")[0] == "neuros_nest":
         return True
     plugin = read_plugin(node.plugin)
-    return plugin is not None and any(n.name.partition(".")[0] == "nest" for n in plugin.needs)
+    parts = [] if plugin is None else [plugin, *modules_beside(plugin)]
+    return any(each.name.partition(".")[0] == "nest" for part in parts for each in part.needs)
 
 
 def _handler() -> object:
@@ -651,16 +655,18 @@ class _Watchdog:
         self._thread_id = threading.get_ident()
         self._is_over = threading.Event()
         self._lock = threading.Lock()
+        self._thread = threading.Thread(target=self._watch, name="neuros-watchdog", daemon=True)
         self.hang = ""
 
     def begin(self) -> None:
         """Watch from now on."""
-        threading.Thread(target=self._watch, name=_WATCHDOG, daemon=True).start()
+        self._thread.start()
 
     def end(self) -> None:
         """Watch no more. Raises what it has set for this thread and has not come yet."""
         with self._lock:
             self._is_over.set()
+        self._thread.join()
         for _ in range(_CHECKS if self.hang else 0):
             """Python raises what another thread has set at the next turn of a loop."""
 

@@ -76,7 +76,10 @@ class Session:
         self._lock = threading.RLock()
         self._outputs: dict[str, _Received] = {}
         self.runs: list[Run] = []
+        self._settings: Mapping[str, Any] = {}  # of the reset with which the run began
+        self._checked: set[str] = set()  # paths of settings
         self._hold(prepare(seed, {})())
+        self._usual = self._project
 
     def _hold(self, held: Held) -> None:
         """Take a run that has just been started."""
@@ -197,23 +200,30 @@ class Session:
         """
         with self._lock:
             seed = self._seed if seed is None else seed
-            settings = with_model_fields(self._project, set or {})
+            settings = with_model_fields(self._usual, set or {})
+            if not settings.keys() <= self._checked:
+                self._prepare(seed, settings)  # says what is wrong with them
+                self._checked |= settings.keys()
             if not self._reset_in_place(seed, settings):
                 start = self._prepare(seed, settings)  # what is wrong ends no run
                 self.runs.append(self.close("the session was reset"))
                 self._hold(start())
+                self._settings = settings
             self._seed = seed
 
     def _reset_in_place(self, seed: int | None, settings: Mapping[str, Any]) -> bool:
         """Whether the nodes could be reset in their process."""
         variables = {} if seed is None else seed_variables(self._project, seed)
-        names = [node.name for node in self._project.nodes]
-        for path, value in settings.items():
+        usual = {node.name: node.environment for node in self._usual.nodes}
+        for path in (*self._settings, *settings):
             kind, _, rest = path.partition(".")
             node, _, rest = rest.partition(".")
             place, _, variable = rest.partition(".")
-            is_variable = kind == "nodes" and node in names and place == "environment"
-            if not (is_variable and variable) or value is None:
+            is_variable = kind == "nodes" and node in usual and place == "environment"
+            if not (is_variable and variable):
+                return False
+            value = settings[path] if path in settings else usual[node].get(variable)
+            if value is None:
                 return False
             variables.setdefault(node, {})[variable] = value_text(path, value)
         try:

@@ -73,6 +73,7 @@ class ContextSwitch:
         self._current = self._process
         self._known_modules = len(sys.modules)
         self._owners: dict[str, Context] = {}
+        self._before = {name for name in _FOR_ONE_NODE if name in sys.modules}
         # By the contexts before and after a switch, the variables in which nodes differ.
         self._differing: dict[tuple[Context, Context], list[Any]] = {}
 
@@ -139,6 +140,17 @@ class ContextSwitch:
         if self in sys.meta_path:
             sys.meta_path.remove(self)
 
+    def claim(self, name: str) -> None:
+        """Let a library be of the node whose context is in place, if it has been imported.
+
+        One that the process has had before is nobody's else.
+        """
+        if name in sys.modules and name not in self._owners:
+            self._owners[name] = context = self._current
+            context.modules[name] = self._process.modules[name] = sys.modules[name]
+            if self not in sys.meta_path:
+                sys.meta_path.insert(0, self)
+
     def why_bound(self, context: Context) -> str:
         """Which library holds state of this node outside of its modules; empty if none does."""
         names = [name for name, owner in self._owners.items() if owner is context]
@@ -185,12 +197,9 @@ class ContextSwitch:
         for name, module in tuple(sys.modules.items()):
             if context.hides(module):
                 context.modules[name] = module
-        for name in _FOR_ONE_NODE:
-            if name in sys.modules and name not in self._owners and context is not self._process:
-                self._owners[name] = context
-                context.modules[name] = self._process.modules[name] = sys.modules[name]
-                if self not in sys.meta_path:
-                    sys.meta_path.insert(0, self)
+        if context is not self._process:
+            for name in _FOR_ONE_NODE.keys() - self._before:
+                self.claim(name)
 
     def _set_variables(self, old: Context, new: Context) -> None:
         """Let C libraries see the variables that differ (``getenv``)."""

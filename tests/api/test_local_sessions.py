@@ -128,6 +128,14 @@ def begin(node):
 @neuros_tick(3600.0)
 def look(node): ...
 """
+USES_NEST = """
+import helper
+from neuros.hooks import neuros_function
+
+@neuros_function(outputs="x")
+def look(node):
+    return node.make_packet("x")
+"""
 HEARS_ITSELF = """
 from std_msgs.msg import Float64
 from neuros.hooks import neuros_function, neuros_initialise
@@ -315,6 +323,27 @@ class TestTheProgram:
                 s.step()
             assert Path.cwd() == tmp_path
         assert s.close().exit_code == 1
+
+    def test_nest_is_of_one_session_and_of_its_nodes_that_import_it(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        nest, resets = ModuleType("nest"), []
+        nest.ResetKernel = lambda: resets.append(1)  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "nest", nest)  # the program had it before
+        for name in ("plain", "brain"):
+            (tmp_path / name).mkdir()
+        plain = project_of(tmp_path / "plain", LOOKS_AT_ITS_PLACE)
+        brain = project_of(tmp_path / "brain", USES_NEST)
+        (tmp_path / "brain" / "helper.py").write_text("import nest")
+        for _ in range(2):
+            with plain.session() as s, brain.session() as user:
+                with pytest.raises(UsageError, match="NEST has one kernel per process"):
+                    brain.session()
+                for each in (s, user):
+                    each.reset()
+                    each.step()
+                assert (len(s.runs), len(user.runs)) == (0, 1)
+        assert len(resets) == 4
 
     def test_until_may_reset_and_close_the_session(self, tmp_path: Path) -> None:
         with project_of(tmp_path, LOOKS_AT_ITS_PLACE).session() as s:

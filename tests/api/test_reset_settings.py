@@ -117,6 +117,55 @@ def test_a_session_may_begin_with_fields_of_a_model(tmp_path: Path) -> None:
         assert fallen(s) == 0.0
 
 
+def test_fields_of_the_session_hold_in_every_episode(tmp_path: Path) -> None:
+    project = neuros.Project.from_file(falling(tmp_path))
+    with project.session(set={"world.model.opt.gravity": 0}) as s:
+        s.reset(set={"world.model.geom_friction": 0.4})
+        assert fallen(s) == 0.0
+        s.reset(set={"world.model.opt.gravity": [0, 0, -1.0]})
+        assert fallen(s) > 0.0
+        s.reset()
+        assert fallen(s) == 0.0
+
+
+def test_an_entity_may_be_spawned_in_an_episode_with_settings(tmp_path: Path) -> None:
+    spawns = KEEPS.replace(
+        "    simulator.step_synchronous()",
+        "    if simulator.sim_time == 0.0 and not node.has_spawned:\n"
+        "        node.has_spawned = True\n"
+        "        simulator.spawn_entity('ball.xml', [0, 0, 20.0], 'second')\n"
+        "    simulator.step_synchronous()",
+    ).replace("def begin(node):", "def begin(node):\n    node.has_spawned = False")
+    with neuros.Project.from_file(falling(tmp_path, spawns)).session() as s:
+        s.reset(set={"world.model.geom_friction": 0.4})
+        s.step()
+        s.reset()
+        assert fallen(s) > 0.0
+
+
+@pytest.mark.filterwarnings("ignore:.*nothing in the plugin of node 'thrower' reads OTHER")
+@pytest.mark.parametrize(
+    "begun_with",
+    [
+        {"nodes.thrower.environment.FACES": 1},
+        {"nodes.thrower.environment.FACES": 1, "nodes.thrower.parameters": {"other": 1}},
+        {"nodes.thrower.environment.FACES": 1, "nodes.thrower.environment.OTHER": 1},
+    ],
+)
+def test_settings_with_which_a_run_began_hold_for_its_first_episode_alone(
+    tmp_path: Path, begun_with: dict[str, object]
+) -> None:
+    with neuros.Project.from_file(dice(tmp_path, ENDLESS)).session() as s:
+        s.close()  # the next reset takes a new run
+        s.reset(set=begun_with)
+        s.step(5)
+        assert {packet.data for packet in s["thrower.eyes"].packets} == {1}
+        for _ in range(2):
+            s.reset()
+            s.step(20)
+            assert {packet.data for packet in s["thrower.eyes"].packets} == {*range(1, 7)}
+
+
 @settings(max_examples=20, deadline=None)
 @given(gravity=st.lists(st.floats(-20, 0), min_size=1, max_size=4))
 def test_what_an_episode_is_depends_on_its_own_settings_alone(
@@ -144,6 +193,12 @@ def falls(tmp_path_factory: pytest.TempPathFactory) -> Session:
         ("geom_friction", [1.0], r"'geom_friction' has the shape \(1, 3\), not \(1,\)"),
         ("geom_friction", "rough", "geom_friction='rough': give numbers"),
         ("names", 3, "no field 'names' with numbers"),
+        ("opt", 3, r"no field 'opt' with numbers \(see the fields of mujoco.MjModel\)"),
+        ("opt.gravit", 3, r"no field 'opt.gravit' with numbers \(did you mean 'gravity'\?\)"),
+        ("opt.timestep", 0.001, "'opt.timestep' cannot be changed here"),
+        ("nq", 3, "'nq' cannot be changed"),
+        ("geom_type", 0.7, "geom_type=0.7: give whole numbers"),
+        ("opt.integrator", 1.5, "opt.integrator=1.5: give whole numbers"),
     ],
 )
 def test_a_field_that_the_model_lacks_is_named(
@@ -154,6 +209,13 @@ def test_a_field_that_the_model_lacks_is_named(
             s.reset(set={f"world.model.{field}": value})
         s.reset()
         assert fallen(s) > 0.0
+
+
+def test_a_variable_that_nothing_reads_is_a_warning(tmp_path: Path) -> None:
+    with neuros.Project.from_file(dice(tmp_path, ENDLESS)).session() as s:
+        with pytest.warns(UserWarning, match="nothing in the plugin of node 'thrower' reads FACSE"):
+            s.reset(set={"nodes.thrower.environment.FACSE": 1})
+        assert not s.runs
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import numpy as np
 
 from neuros.errors import DescriptionError, ModelError, UsageError
 from neuros.ports import NodeContext, Packet
+from neuros.project import suggest
 from neuros.project.model import MODEL_FIELDS, Node
 from neuros.registry import MODELS
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
@@ -24,6 +25,7 @@ from neuros.simulators.mujoco.sensor_base import Sensor
 from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
 from neuros.simulators.mujoco.timing import FiringSchedule, Timebase
 
+_NUMBERS = (int, float, np.ndarray)  # types of fields of a model
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
 
@@ -229,6 +231,7 @@ class World(Declared):
         """
         old, before = self.model, self.data
         self.model, self.data = self._spec.recompile(old, before)
+        self._fields = ModelFields(self.where)
         self.cameras.use(self.model)
         self._bound = self._bind(self.model, Problems(self._node.description.file))
         mujoco.mj_forward(self.model, self.data)
@@ -304,28 +307,37 @@ class ModelFields:
         for each in owners:
             owner = getattr(owner, each, None)
         before = getattr(owner, last, None)
-        if not isinstance(before, int | float | np.ndarray):
-            known = [n for n in dir(owner) if isinstance(getattr(owner, n, None), np.ndarray)]
+        if not isinstance(before, _NUMBERS):
+            known = [n for n in dir(owner) if isinstance(getattr(owner, n, None), _NUMBERS)]
+            hint = suggest.did_you_mean(last, known) or "see the fields of mujoco.MjModel"
             raise ModelError(
-                f"{self._where}: the model has no field '{name}' with numbers"
-                f" ({did_you_mean(last, known) or 'see the fields of mujoco.MjModel'})"
+                f"{self._where}: the model has no field '{name}' with numbers ({hint})"
+            )
+        if name == "opt.timestep":
+            raise ModelError(
+                f"{self._where}: 'opt.timestep' cannot be changed here, since sensors have periods"
+                " of whole timesteps: change it in the model"
             )
         try:
             array = np.asarray(value, np.float64)
         except (TypeError, ValueError):
             raise ModelError(f"{self._where}: {name}={value!r}: give numbers") from None
-        shape = np.shape(before)
-        if array.shape not in ((), shape):
+        old = np.array(before)
+        if array.shape not in ((), old.shape):
             raise ModelError(
-                f"{self._where}: '{name}' has the shape {shape}, not {array.shape}: give all its"
-                " values, or a number for all of them"
+                f"{self._where}: '{name}' has the shape {old.shape}, not {array.shape}: give all"
+                " its values, or a number for all of them"
             )
-        if isinstance(before, np.ndarray):
-            before = before.copy()
-            getattr(owner, last)[...] = array
-        else:
-            setattr(owner, last, type(before)(array))
-        return before
+        if old.dtype.kind != "f" and (array % 1).any():
+            raise ModelError(f"{self._where}: {name}={value!r}: give whole numbers")
+        try:
+            if isinstance(before, np.ndarray):
+                before[...] = array
+            else:
+                setattr(owner, last, type(before)(array))
+        except (AttributeError, ValueError):
+            raise ModelError(f"{self._where}: '{name}' cannot be changed") from None
+        return old
 
 
 def _frame_of(entity: str) -> str:
