@@ -186,6 +186,10 @@ class LocalRun:
         """A packet of its own for the program."""
         return self._middleware.packets.copier(type_name)(content)
 
+    def size_of(self, content: Any) -> int:
+        """The bytes of a packet when it is serialised."""
+        return len(self._middleware.packets.encode(content))
+
     def look(self) -> Sequence[NodeStatus] | None:
         """State and counters of each node."""
         if self._run is not None or (not self._is_behind and self.advance(0, {}) is None):
@@ -394,10 +398,11 @@ class LocalRun:
         """Write a record into the log of its node, and pass it on to Python's ``logging``."""
         node = name.partition(".")[0]
         line = format_record(record.severity, name, record.text) + "\n"
-        with contextlib.suppress(OSError), open(self.folder / node / "node.log", "a") as log:
-            log.write(line)
+        data = line.encode("utf-8", "backslashreplace")
+        with contextlib.suppress(OSError), open(self.folder / node / "node.log", "ab") as log:
+            log.write(data)
         if self._is_shown:
-            sys.stdout.write(line)
+            sys.stdout.write(data.decode())
         log_in_python(name, record)
 
     # ------------------------------------------------------------------ the end

@@ -37,7 +37,7 @@ from neuros.api.session_link import (
 )
 from neuros.control import AtRest, NodeStatus
 from neuros.errors import NeurosError, RunError, UsageError
-from neuros.node.instruments import MOST_PACKETS
+from neuros.node.instruments import room_for
 from neuros.project.graph import graph_svg
 from neuros.project.model import Node, Port
 from neuros.transport.messages import checked
@@ -421,7 +421,7 @@ class Session:
             return False
         self._sim_times = answer.sim_times
         for name, (count, contents) in answer.packets.items():
-            self._outputs[name].add(count, contents)
+            self._outputs[name].add(count, contents, self._held.size_of)
             self._known[name] = count
         return True
 
@@ -461,7 +461,7 @@ class Session:
         """Keep the packets that came after the last answer."""
         count, contents = self._held.last_packets(name)
         if count > received.count:
-            received.add(count, contents[received.count - count :])
+            received.add(count, contents[received.count - count :], self._held.size_of)
 
     def _check_running(self) -> None:
         if self._run is not None:
@@ -494,13 +494,16 @@ class _Received:
     def begin_anew(self) -> None:
         """The run is another one."""
         self.count, self.newest = 0, None
-        self.unread: deque[Any] = deque(maxlen=MOST_PACKETS)
+        self.unread: deque[Any] = deque()
         self.dropped = 0
 
-    def add(self, count: int, contents: Sequence[Any]) -> None:
+    def add(self, count: int, contents: Sequence[Any], size_of: Callable[[Any], int]) -> None:
         """Packets have come; the last one is the newest of so many."""
+        if self.unread.maxlen is None:
+            self.unread = deque(maxlen=room_for(size_of(contents[0])))
+        assert self.unread.maxlen is not None
         lost = count - self.count - len(contents)
-        room = MOST_PACKETS - len(self.unread)
+        room = self.unread.maxlen - len(self.unread)
         self.dropped += lost + max(0, len(contents) - room)
         self.count, self.newest = count, contents[-1]
         self.unread.extend(contents)

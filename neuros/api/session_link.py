@@ -93,6 +93,9 @@ class HeldRun(Protocol):
     def copy(self, type_name: str, content: Any) -> Any:
         """A packet of its own for the program, from the content that came with an answer."""
 
+    def size_of(self, content: Any) -> int:
+        """The bytes of the content of a packet."""
+
     def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
         """Bring all nodes back to their start, paused; ``False`` if they cannot be, or have ended.
 
@@ -189,6 +192,9 @@ class LaunchedRun:
 
     def copy(self, type_name: str, content: bytes) -> Any:
         return self._packets.decode(type_name, content)
+
+    def size_of(self, content: bytes) -> int:
+        return len(content)
 
     def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
         # A round that was given up may go on for ever: it ends as a free run does.

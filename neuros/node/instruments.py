@@ -52,9 +52,13 @@ class Instrument(Protocol):
         """Add what looks at the packets of a tap, at once or for as long as it is asked for."""
 
 
-MOST_PACKETS = 1000
-"""Of an output, a session can read so many packets at most."""
+_MOST_PACKETS = 1000
 _MOST_BYTES = 64_000_000
+
+
+def room_for(size: int) -> int:
+    """How many packets of so many bytes each a session can read of an output."""
+    return max(1, min(_MOST_PACKETS, _MOST_BYTES // max(1, size)))
 
 
 class PacketHistory:
@@ -69,9 +73,7 @@ class PacketHistory:
 
     def __init__(self, size: int) -> None:
         self.count = 0
-        self.packets: deque[Any] = deque(
-            maxlen=max(1, min(MOST_PACKETS, _MOST_BYTES // max(1, size)))
-        )
+        self.packets: deque[Any] = deque(maxlen=room_for(size))
 
     def newest(self, most_bytes: int) -> list[bytes]:
         """The newest packets that have so many bytes together; the last one in any case."""

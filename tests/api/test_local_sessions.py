@@ -136,6 +136,15 @@ from neuros.hooks import neuros_function
 def look(node):
     return node.make_packet("x")
 """
+SENDS_PICTURES = """
+from neuros.hooks import neuros_function
+
+@neuros_function(outputs="x")
+def show(node):
+    x = node.make_packet("x")
+    x.data = bytes(1_000_000)
+    return x
+"""
 HEARS_ITSELF = """
 from std_msgs.msg import Float64
 from neuros.hooks import neuros_function, neuros_initialise
@@ -253,6 +262,14 @@ class TestTheProgram:
             s.step()
         assert ("neuros.a", logging.WARNING, "looking") in caplog.record_tuples
         assert "[WARN]" in s.close().log("a")
+
+    def test_a_log_takes_any_text(self, tmp_path: Path) -> None:
+        says = LOOKS_AT_ITS_PLACE.replace(
+            "    time.sleep(0)", r"    node.get_logger().info('5 \u00b5m, \udc80')"
+        )
+        with project_of(tmp_path, says).session() as s:
+            s.step()
+        assert "5 µm, \\udc80" in s.close().log("a")
 
     def test_an_ended_session_has_a_record_like_any_run(self, tmp_path: Path) -> None:
         with neuros.Project.from_file(dice(tmp_path)).session(seed=4) as s:
@@ -569,6 +586,16 @@ class TestHistory:
             with pytest.warns(UserWarning, match=r"robot\.pose: 200 packets were dropped"):
                 assert len(s["robot.pose"].packets) == 1000
             assert s["robot.pose"].dropped == 0
+
+    def test_large_packets_have_64_mb(self, tmp_path: Path) -> None:
+        outputs = [{"name": "x", "type": "sensor_msgs/msg/Image"}]
+        with project_of(tmp_path, SENDS_PICTURES, outputs=outputs).session() as s:
+            for _ in range(70):
+                s.step()
+                assert s["a.x"].packet is not None
+            assert s["a.x"].dropped == 70 - 63
+            with pytest.warns(UserWarning, match=r"a\.x: 7 packets were dropped"):
+                assert len(s["a.x"].packets) == 63
 
     def test_a_packet_that_a_program_reads_is_its_own(self, stepped: Session) -> None:
         stepped.step()
