@@ -58,6 +58,9 @@ def act(node, joints):
 
 @neuros_finalise()
 def end(node):
-    upright_s = node.get_user_data()["upright"] / RATE_HZ
+    own = node.get_user_data()
+    if own is None:  # ended before the start
+        return
+    upright_s = own["upright"] / RATE_HZ
     node.set_result("upright_s", upright_s)
     node.get_logger().info(f"upright for {upright_s:.1f} s")

@@ -23,7 +23,7 @@ from std_msgs.msg import Float64
 
 import neuros
 import neuros.gym
-from neuros.errors import ProjectError, UsageError
+from neuros.errors import ProjectError, RunError, UsageError
 
 ROOT = Path(__file__).resolve().parents[3]
 EXAMPLE = ROOT / "examples" / "7_learning" / "cartpole"
@@ -504,6 +504,13 @@ def test_the_code_of_the_page_runs(
     codes = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
     exec(compile("\n".join(codes), str(PAGE), "exec"), {"__name__": "page"})
     assert "steps" in capsys.readouterr().out
+
+
+def test_weights_of_the_example_that_are_missing_are_its_only_error(tmp_path: Path) -> None:
+    missing = {"nodes.policy.environment.POLICY": "nothing.txt"}
+    with pytest.raises(RunError, match=r"'nothing\.txt' does not exist"):
+        neuros.Project.from_file(EXAMPLE).session(set=missing, output=tmp_path / "run")
+    assert (tmp_path / "run" / "policy" / "node.log").read_text().count("[ERROR]") == 1
 
 
 @pytest.mark.acceptance
