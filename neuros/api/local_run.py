@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import ctypes
+import logging
 import math
 import os
 import signal
@@ -95,7 +96,12 @@ class LocalRun:
         self._loop = LocalLoop()
         digest = digest_of if request.digests else None
         self._middleware = LocalMiddleware(
-            self._loop, self._write, self._fail_in_callback, exposes=exposes, digest=digest
+            self._loop,
+            self._write,
+            self._fail_in_callback,
+            exposes=exposes,
+            digest=digest,
+            level=logging.INFO,
         )
         self._contexts.hide_from_nodes(project.folder)
         self._nodes: dict[str, NodeRuntime] = {}

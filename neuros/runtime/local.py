@@ -9,7 +9,9 @@ after the events that wait.
 from __future__ import annotations
 
 import logging
+import math
 import os
+import sys
 import threading
 import time
 from collections import deque
@@ -188,38 +190,70 @@ def log_in_python(name: str, record: Record) -> None:
 class LocalLogger:
     """The logger of a node without ROS; its methods are those of rclpy's logger.
 
-    ``once``, ``skip_first`` and ``throttle_duration_sec`` are accepted and have no effect.
-
     Args:
         write: is given the name of the logger, and each record.
+        level: the lowest severity that is written, as a number of ``logging`` or of rclpy.
     """
 
-    def __init__(self, name: str, write: Callable[[str, Record], object]) -> None:
+    def __init__(
+        self, name: str, write: Callable[[str, Record], object], level: int = logging.DEBUG
+    ) -> None:
         self.name = name
         self._write = write
+        self._level = level
+        self._calls: dict[tuple[str, int], tuple[int, float]] = {}  # number, last written (s)
 
     def get_child(self, name: str) -> LocalLogger:
         """A child logger, whose records go to the same place."""
-        return LocalLogger(f"{self.name}.{name}", self._write)
+        return LocalLogger(f"{self.name}.{name}", self._write, self._level)
 
-    def debug(self, message: str, **_: Any) -> bool:
-        return self._log("DEBUG", message)
+    def set_level(self, level: int) -> None:
+        self._level = int(level)
 
-    def info(self, message: str, **_: Any) -> bool:
-        return self._log("INFO", message)
+    def get_effective_level(self) -> int:
+        return self._level
 
-    def warning(self, message: str, **_: Any) -> bool:
-        return self._log("WARN", message)
+    def is_enabled_for(self, severity: int) -> bool:
+        return int(severity) >= self._level
+
+    def debug(self, message: str, **options: Any) -> bool:
+        return self._log("DEBUG", message, **options)
+
+    def info(self, message: str, **options: Any) -> bool:
+        return self._log("INFO", message, **options)
+
+    def warning(self, message: str, **options: Any) -> bool:
+        return self._log("WARN", message, **options)
 
     warn = warning
 
-    def error(self, message: str, **_: Any) -> bool:
-        return self._log("ERROR", message)
+    def error(self, message: str, **options: Any) -> bool:
+        return self._log("ERROR", message, **options)
 
-    def fatal(self, message: str, **_: Any) -> bool:
-        return self._log("FATAL", message)
+    def fatal(self, message: str, **options: Any) -> bool:
+        return self._log("FATAL", message, **options)
 
-    def _log(self, severity: str, message: str) -> bool:
+    def _log(
+        self,
+        severity: str,
+        message: str,
+        *,
+        once: bool = False,
+        skip_first: bool = False,
+        throttle_duration_sec: float = 0.0,
+        **_: Any,
+    ) -> bool:
+        if not self.is_enabled_for(_LEVELS[severity]):
+            return False
+        if once or skip_first or throttle_duration_sec:
+            caller = sys._getframe(2)
+            place, now_s = (caller.f_code.co_filename, caller.f_lineno), time.monotonic()
+            number, last_s = self._calls.get(place, (0, -math.inf))
+            self._calls[place] = number + 1, last_s
+            is_early = now_s - last_s < (math.inf if once else throttle_duration_sec)
+            if is_early or (skip_first and number == 0):
+                return False
+            self._calls[place] = number + 1, now_s
         self._write(self.name, Record(severity, str(message)))
         return True
 
@@ -332,6 +366,7 @@ class LocalMiddleware(WithoutPeers):
         on_failure: is called with the errors of callbacks of ROS.
         exposes: whether ROS tools see the topics of the connections.
         digest: makes a number of a packet, where digests are kept.
+        level: of the log.
     """
 
     def __init__(
@@ -342,6 +377,7 @@ class LocalMiddleware(WithoutPeers):
         *,
         exposes: bool = False,
         digest: Callable[[Any], int | None] | None = None,
+        level: int = logging.DEBUG,
     ) -> None:
         self.loop = loop
         self.packets = RosPackets()
@@ -350,13 +386,14 @@ class LocalMiddleware(WithoutPeers):
         self._on_failure = on_failure
         self._exposes = exposes
         self._digest = digest
+        self._level = level
         self._ros: _Ros | None = None
         self._ros_nodes: dict[str, LocalRosNode] = {}
         self._marks: dict[str, tuple[Event, Callable[[Any, BaseException], None]]] = {}
 
     def transport(self, file: NodeFile) -> Transport:
         self._ros_nodes[file.node.name] = self.local_ros_node(
-            file, LocalLogger(file.node.name, self._write)
+            file, LocalLogger(file.node.name, self._write, self._level)
         )
         return MemoryTransport(file, self.hub, self.bridge(file), self._digest)
 

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -145,6 +146,24 @@ def show(node):
     x.data = bytes(1_000_000)
     return x
 """
+SPEAKS = """
+from rclpy.logging import LoggingSeverity
+from neuros.hooks import neuros_function
+
+@neuros_function(outputs="x")
+def speak(node):
+    log = node.get_logger()
+    log.debug("detail")
+    log.info("at first", once=True)
+    log.info("now and then", throttle_duration_sec=3600.0)
+    log.info("later", skip_first=True)
+    log.get_child("inner").warn("always")
+    log.set_level(LoggingSeverity.WARN)
+    log.info("too much")
+    assert not log.is_enabled_for(LoggingSeverity.INFO)
+    log.set_level(LoggingSeverity.INFO)
+    return node.make_packet("x")
+"""
 HEARS_ITSELF = """
 from std_msgs.msg import Float64
 from neuros.hooks import neuros_function, neuros_initialise
@@ -262,6 +281,14 @@ class TestTheProgram:
             s.step()
         assert ("neuros.a", logging.WARNING, "looking") in caplog.record_tuples
         assert "[WARN]" in s.close().log("a")
+
+    def test_a_node_logs_what_it_logs_elsewhere(self, tmp_path: Path, back_end: str) -> None:
+        with project_of(tmp_path, SPEAKS).session(backend=back_end) as s:
+            s.step(3, timeout_s=DEADLINE_S)
+        lines = [line.partition("]: ")[2] for line in s.close().log("a").splitlines()]
+        count = Counter(lines)
+        said = ("detail", "at first", "now and then", "later", "always", "too much")
+        assert [count[text] for text in said] == [0, 1, 1, 2, 3, 0]
 
     def test_a_log_takes_any_text(self, tmp_path: Path) -> None:
         says = LOOKS_AT_ITS_PLACE.replace(
