@@ -435,8 +435,7 @@ class LocalRun:
             atexit.unregister(self._end_with_program)
             if LocalRun._nest_user is self:
                 LocalRun._nest_user = None
-            self._record()
-            self._run = Run(self.folder)
+            self._run = self._record()
 
     def _drain(self, drain_s: float, stopped: str) -> None:
         last_round = self._declarations.last_round(stopped)
@@ -449,7 +448,7 @@ class LocalRun:
             self._outcome.late_drain = str(error)
         self._outcome.has_drained = True
 
-    def _record(self) -> None:
+    def _record(self) -> Run:
         plan, outcome = self._plan, self._outcome
         outcome.ended_s = time.monotonic()
         if outcome.started_s is not None:
@@ -471,6 +470,10 @@ class LocalRun:
         save_record(record, outcome, self.folder, self._run_id)
         if self._is_shown:
             sys.stdout.write(f"\n{run_table(record)}\n\n{outcome.reason}\n")
+        try:
+            return Run(self.folder)
+        except NeurosError:  # the disk is full, and the reason of the end says so
+            return Run.unwritten(self.folder, record)
 
     def _end_with_program(self) -> None:
         if _Thread.turn.acquire(timeout=_GRACE_S):  # else a hook runs for ever in another thread

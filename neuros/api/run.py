@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import os
 from collections.abc import Mapping
 from functools import cached_property
@@ -39,6 +40,13 @@ class Run(PastRun):
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         path = Path(folder).absolute()
         super().__init__(path, open_run(path).record)
+
+    @classmethod
+    def unwritten(cls, folder: Path, record: Mapping[str, Any]) -> Run:
+        """A run whose ``run.json`` could not be written."""
+        run = cls.__new__(cls)
+        PastRun.__init__(run, folder, json.loads(json.dumps(record)))
+        return run
 
     @property
     def project(self) -> str:

@@ -6,8 +6,10 @@ import contextlib
 import json
 import logging
 import os
+import re
 import signal
 import sys
+import tempfile
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -458,6 +460,18 @@ class TestFailures:
             s.step(2)
             assert s["a.x"].count == 2
         assert [run.exit_code for run in s.runs] == [130]
+
+    def test_a_record_that_cannot_be_written_is_the_reason_of_the_end(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+        with project_of(tmp_path, LOOKS_AT_ITS_PLACE).session() as s:
+            s.step(2)
+            (s.folder / "run.json").mkdir()
+        run = s.close()
+        assert run.exit_code == 4
+        assert re.search(r"run\.json cannot be written .*: it is in .* instead", run.reason)
+        assert [*tmp_path.glob("neuros-*/run.json")]
 
     def test_a_plugin_with_a_thread_takes_a_new_run_at_a_reset(self, tmp_path: Path) -> None:
         project = project_of(tmp_path, SENDS_FROM_A_THREAD)
