@@ -21,8 +21,8 @@ from typing import Any, ClassVar
 
 from neuros.api.plan import Plan
 from neuros.api.run import Run
-from neuros.api.run_folder import make_run_folder, save_record, write_node_files
-from neuros.api.run_record import judge, run_record, run_table
+from neuros.api.run_folder import make_run_folder, removed_folders, save_record, write_node_files
+from neuros.api.run_record import EXIT_ENVIRONMENT, judge, run_record, run_table
 from neuros.api.session_link import why_it_ended
 from neuros.backends.console import format_record
 from neuros.control import AtRest, Message, NodeStatus, Ready, Shutdown
@@ -451,6 +451,8 @@ class LocalRun:
     def _record(self) -> Run:
         plan, outcome = self._plan, self._outcome
         outcome.ended_s = time.monotonic()
+        for fault in (*removed_folders(self._files, self.folder), *outcome.faults):
+            outcome.fail(fault, EXIT_ENVIRONMENT)
         if outcome.started_s is not None:
             outcome.paused_s += outcome.ended_s - outcome.started_s
         wall_s = outcome.ended_s - (outcome.started_s or self._started_s)
@@ -554,7 +556,11 @@ class _Thread:
         return self
 
     def __enter__(self) -> None:
-        self.turn.acquire()
+        watchdog = self._watchdog
+        left_s = -1.0 if watchdog is None else max(0.0, watchdog.end_s - time.monotonic())
+        if not self.turn.acquire(timeout=left_s):
+            self._watchdog = None
+            raise TimeoutError("a hook of another session has not returned in time")
         try:
             self._note_folder()
             # A notebook exchanges the handler with each cell, so it is looked at after a pause.
@@ -570,8 +576,8 @@ class _Thread:
             raise
         if threading.active_count() != len(self._others):
             self._others = {*threading.enumerate()}
-        if self._watchdog is not None:
-            self._watchdog.begin()
+        if watchdog is not None:
+            watchdog.begin()
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: object
@@ -659,11 +665,12 @@ class _Watchdog:
         describe: where the thread of this number stands.
 
     Attributes:
+        end_s: that time.
         hang: where the hook stood that did not return; empty if there was none.
     """
 
     def __init__(self, end_s: float, loop: LocalLoop, describe: Callable[[int], str]) -> None:
-        self._end_s = end_s
+        self.end_s = end_s
         self._loop = loop
         self._describe = describe
         self._thread_id = threading.get_ident()
@@ -685,7 +692,7 @@ class _Watchdog:
             """Python raises what another thread has set at the next turn of a loop."""
 
     def _watch(self) -> None:
-        if self._is_over.wait(max(0.0, self._end_s - time.monotonic())):
+        if self._is_over.wait(max(0.0, self.end_s - time.monotonic())):
             return
         self._loop.interruption = TimeoutError("the run has not come to rest in time")
         if self._is_over.wait(_GRACE_S):

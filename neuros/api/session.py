@@ -43,6 +43,7 @@ from neuros.project.model import Node, Port
 from neuros.transport.messages import checked
 
 _READ_S = 1.0
+_LONGEST_S = 1e6  # operating systems wait for no more than some weeks
 _MOST_ROUNDS_AT_REST = 1000
 _FINE = 1e-9
 _MOST_VARIATION = 2.0
@@ -144,7 +145,7 @@ class Session:
                 and for a length that is no number, negative or not finite.
         """
         count = check_length(rounds, sim_s, until)
-        end_s = None if timeout_s is None else time.monotonic() + check_seconds(timeout_s=timeout_s)
+        end_s = _end_of(timeout_s)
         with self._lock:
             self._check_running()
             if until is not None and self._held.is_behind and not self._advance(0, end_s):
@@ -438,9 +439,7 @@ class Session:
                 self._known[output] = 0
                 if self._run is not None:
                     self._take_last(output, received)
-                end_s = None
-                if self._held.is_behind and wait_s is not None:
-                    end_s = time.monotonic() + wait_s
+                end_s = _end_of(wait_s if self._held.is_behind else None)
                 try:
                     if self._run is None:
                         self._advance(0, end_s)
@@ -570,7 +569,7 @@ class SessionOutput:
             RunError: if the run ends before.
         """
         session = self._session
-        end_s = None if timeout_s is None else time.monotonic() + check_seconds(timeout_s=timeout_s)
+        end_s = _end_of(timeout_s)
         before = session._received(self.name, timeout_s).count
 
         def is_there(_: Session) -> bool:
@@ -660,6 +659,13 @@ def check_length(
     if count < 0 or isinstance(rounds, bool):
         raise UsageError(f"rounds={rounds!r}: give 0 or more")
     return count
+
+
+def _end_of(timeout_s: float | None) -> float | None:
+    """When a time-out is over (monotonic, seconds)."""
+    if timeout_s is None:
+        return None
+    return time.monotonic() + min(check_seconds(timeout_s=timeout_s), _LONGEST_S)
 
 
 def check_seconds(**named: Any) -> float:

@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import sys
 import tempfile
@@ -348,6 +349,34 @@ class TestTheProgram:
         assert "NEUROS_RUN_DIR" not in os.environ
         assert len([*(tmp_path / "runs").rglob("run.json")]) == 6
 
+    def test_a_long_time_out_is_one(self, tmp_path: Path, back_end: str) -> None:
+        with project_of(tmp_path, LOOKS_AT_ITS_PLACE).session(backend=back_end) as s:
+            assert s.step(timeout_s=1e300)
+            assert s["a.x"].wait(1e300) is not None
+
+    def test_a_step_waits_for_another_session_no_longer_than_it_may_take(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        runs, may_end = threading.Event(), threading.Event()
+
+        def hold(_: Session) -> None:
+            runs.set()
+            may_end.wait(DEADLINE_S)
+
+        (tmp_path / "other").mkdir()
+        with (
+            project_of(tmp_path / "other", LOOKS_AT_ITS_PLACE).session() as s,
+            using(tmp_path, monkeypatch, hold) as holding,
+            ThreadPoolExecutor(1) as thread,
+        ):
+            holds = thread.submit(holding.step)
+            runs.wait(DEADLINE_S)
+            with pytest.raises(TimeoutError, match="a hook of another session"):
+                s.step(timeout_s=0.01)
+            may_end.set()
+            assert holds.result(DEADLINE_S)
+            assert s.step(timeout_s=DEADLINE_S)
+
     def test_a_hook_may_step_another_session(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -472,6 +501,12 @@ class TestFailures:
         assert run.exit_code == 4
         assert re.search(r"run\.json cannot be written .*: it is in .* instead", run.reason)
         assert [*tmp_path.glob("neuros-*/run.json")]
+
+    def test_a_run_folder_that_is_removed_is_a_fault_of_the_run(self, tmp_path: Path) -> None:
+        with project_of(tmp_path, LOOKS_AT_ITS_PLACE).session() as s:
+            shutil.rmtree(s.folder)
+        assert s.close().exit_code == 4
+        assert str(s.folder) in s.close().reason
 
     def test_a_plugin_with_a_thread_takes_a_new_run_at_a_reset(self, tmp_path: Path) -> None:
         project = project_of(tmp_path, SENDS_FROM_A_THREAD)
