@@ -181,7 +181,7 @@ def neuros_finalise() -> Callable[[_Function], _Function]:
     return _marker(HookKind.FINALISE, None, None)
 
 
-def hook_specs_of(namespace: dict[str, Any]) -> tuple[HookSpec, ...]:
+def hook_specs_of(namespace: Mapping[Any, Any]) -> tuple[HookSpec, ...]:
     """The marks of all functions in a module's namespace, in the order of their declaration."""
     functions = {id(value): value for value in namespace.values() if _marks(value)}
     return tuple(

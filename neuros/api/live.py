@@ -18,6 +18,8 @@ from neuros.api.execution import Execution
 from neuros.api.plan import Plan
 from neuros.api.run import Run
 
+EXIT_PROGRAM = 7
+
 
 class LiveRun:
     """A run in a thread of its own, from :meth:`begin` on; :meth:`wait` returns the result.
@@ -38,7 +40,7 @@ class LiveRun:
 
     def __init__(self, plan: Plan, *, is_shown: bool) -> None:
         self._signals: list[int] = []
-        self._wishes: list[str] = []
+        self._wishes: list[tuple[str, int]] = []
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._done = threading.Event()
@@ -85,7 +87,16 @@ class LiveRun:
 
     def stop(self, reason: str = "stopped by the program") -> None:
         """End the run as if ``--duration`` were over: drained, with exit code 0."""
-        self._wishes.append(reason)
+        self._wishes.append((reason, 0))
+        self._wake()
+
+    def fail(self, error: BaseException) -> None:
+        """End the run now, since this program has failed; Ctrl+C in it is :meth:`interrupt`."""
+        if isinstance(error, KeyboardInterrupt):
+            self.interrupt()
+            return
+        text = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
+        self._wishes.append((f"the program failed: {text}", EXIT_PROGRAM))
         self._wake()
 
     def interrupt(self) -> None:
@@ -143,7 +154,7 @@ class LiveRun:
         if error is None:
             self.stop()
         else:
-            self.interrupt()
+            self.fail(error)
         self.wait()
 
     def __repr__(self) -> str:

@@ -312,7 +312,7 @@ class Session:
         trace: TracebackType | None,
     ) -> None:
         if error is not None and self._run is None:
-            self._live.interrupt()
+            self._live.fail(error)
             self._end()
         self.close()
 

@@ -286,4 +286,5 @@ def port_of(project: Project, name: str, *, is_input: bool) -> tuple[Node, Port]
 def declared_at(node: Node) -> str:
     """Where a node is declared, for messages."""
     line, column = place_of(node.file, node.pointer)
-    return f"node '{node.name}' is declared in {display_name(node.file)}:{line}:{column}"
+    place = f":{line}:{column}" if line else ""
+    return f"node '{node.name}' is declared in {display_name(node.file)}{place}"

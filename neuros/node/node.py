@@ -16,7 +16,7 @@ from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
 from neuros.errors import ControlError, HookError, NeurosError, ProtocolError
-from neuros.hooks import HookKind, HookSpec
+from neuros.hooks import HookKind, HookSpec, hook_specs_of
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices, Results
@@ -84,8 +84,10 @@ class NodeRuntime:
         self._tell = tell
         self._contexts = contexts
         environment = self._environment({})
-        plugin = None if file.node.module else file.node.plugin
-        self._context = contexts.make_context(environment, plugin, file.folders.project, log_file)
+        # Functions of the program share its modules: none is private to the node.
+        plugin = None if file.node.module or file.node.hooks else file.node.plugin
+        own = Path() if file.node.hooks else file.folders.project
+        self._context = contexts.make_context(environment, plugin, own, log_file)
         self._enter = partial(contexts.enter, self._context)
         self._enter()
         self._transport = middleware.transport(file)
@@ -206,7 +208,8 @@ class NodeRuntime:
             return "packets are recorded"
         if self._resets:
             return ""
-        if node.module or not node.plugin.is_relative_to(self.file.folders.project):
+        is_own = node.hooks or node.plugin.is_relative_to(self.file.folders.project)
+        if node.module or not is_own:
             return f"the plugin of {self.name} is not in the project's folder"
         if self._middleware.has_foreign_entities(self.file):
             return f"the plugin of {self.name} has made ROS entities"
@@ -354,9 +357,10 @@ class NodeRuntime:
         node = self.file.node
         for port in (*node.inputs, *node.outputs):  # the plugin may make messages when imported
             self._middleware.packets.message_class(port.type)
-        self.specs = self._plugin = with_clocks(
-            node, load_plugin(node.plugin, self.name, node.module)
-        )
+        specs: Sequence[HookSpec] = hook_specs_of(dict(enumerate(node.hooks)))
+        if not node.hooks:
+            specs = load_plugin(node.plugin, self.name, node.module)
+        self.specs = self._plugin = with_clocks(node, specs)
 
     def _make(self) -> Engine:
         """The engine for the hooks of now."""

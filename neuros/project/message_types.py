@@ -18,6 +18,7 @@ from typing import Any, Protocol
 
 from neuros.project.suggest import did_you_mean, listed
 
+_SHORT = re.compile(r"\A([A-Za-z]\w*)/([A-Za-z]\w*)\Z", re.ASCII)
 _NOTATION = re.compile(r"([A-Za-z]\w*)(?:\.msg\.|/msg/)([A-Za-z]\w*)", re.ASCII)
 _TEXTS = ("string", "wstring", "byte", "octet", "wchar")
 _IMPORTED = re.compile(r"^\s*from\s+\S+\s+import\s+(\w+)", re.MULTILINE)
@@ -82,6 +83,11 @@ def normalised(text: str) -> str | None:
     """``std_msgs/msg/String`` for that or ``std_msgs.msg.String``, ``None`` for anything else."""
     match = _NOTATION.fullmatch(text)
     return f"{match[1]}/msg/{match[2]}" if match else None
+
+
+def in_full(text: str) -> str:
+    """``std_msgs/msg/String`` for ``std_msgs/String``, as Python may write it."""
+    return _SHORT.sub(r"\1/msg/\2", text)
 
 
 def unknown_type(

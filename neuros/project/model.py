@@ -7,7 +7,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
@@ -89,7 +89,7 @@ class Node:
 
     Attributes:
         plugin: absolute path of the Python file with the hooks; ``Path()`` for a module that is
-            not installed on this machine.
+            not installed on this machine. Of ``hooks``: the file of the first one, if it has any.
         script: absolute path of a shell script that runs before the node, or ``None``.
         environment: environment variables, with ``#path`` and ``@path`` already resolved.
         file: the file that describes the node, for messages.
@@ -101,6 +101,7 @@ class Node:
         parameters: values of ROS parameters, by full name.
         module: the plugin as a module of an installed package, else empty.
         finalise_s: seconds of finalisation without progress after which the node is killed.
+        hooks: functions of this program that are the plugin; empty if it is a file. JSON has none.
     """
 
     name: str
@@ -119,6 +120,7 @@ class Node:
     parameters: Mapping[str, Value] = field(default_factory=lambda: _NOTHING, hash=False)
     module: str = ""
     finalise_s: float = FINALISE_S
+    hooks: tuple[Callable[..., Any], ...] = ()
 
     def input(self, name: str) -> Port:
         """The input of that name; raises ``KeyError``."""
@@ -131,6 +133,8 @@ class Node:
     @property
     def plugin_name(self) -> str:
         """The name of the plugin, or of the network in its place, for messages."""
+        if self.hooks:
+            return ", ".join(getattr(hook, "__name__", repr(hook)) for hook in self.hooks)
         if self.module == NETWORK_MODULE:
             return Path(self.environment.get(NETWORK, "")).name
         return self.module or self.plugin.name

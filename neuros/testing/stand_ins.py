@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from neuros.errors import NodeError
 from neuros.ports import Inbox, Transport
-from neuros.project.message_types import normalised
+from neuros.project.message_types import in_full, normalised
 from neuros.project.model import Connection, Node, NodeFile, Port, Value
 from neuros.transport.lean_node import Parameter, ParameterNotDeclaredException
 from neuros.transport.memory import MemoryHub, MemoryTransport
@@ -307,7 +307,7 @@ def ports(types: Mapping[str, str]) -> tuple[Port, ...]:
     """Ports from their names and message types, in either notation."""
     found = []
     for name, written in types.items():
-        type_name = normalised(written)
+        type_name = normalised(in_full(written))
         if type_name is None:
             raise ValueError(
                 f"'{name}': {written!r} is not a message type: write it like 'std_msgs/msg/String'"

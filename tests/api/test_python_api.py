@@ -165,17 +165,18 @@ def test_a_run_in_the_background_is_drained_at_the_end_of_its_block(tmp_path: Pa
 
 
 @ACCEPTANCE
-def test_a_block_that_fails_interrupts_its_run(tmp_path: Path) -> None:
+def test_a_block_that_fails_ends_its_run_and_is_the_reason(tmp_path: Path) -> None:
     live = project(tmp_path, ENDLESS).start(backend="in-process")
 
     def fail_within() -> None:
         with live:
             _await(lambda: "counting" in _log(live.folder))
-            raise LookupError
+            raise LookupError("no map\nof here")
 
     with pytest.raises(LookupError):
         fail_within()
-    assert live.wait().exit_code == 130
+    run = live.wait()
+    assert (run.exit_code, run.reason) == (7, "the program failed: LookupError: no map")
 
 
 def test_neuros_stop_ends_the_run_and_not_the_program(tmp_path: Path) -> None:

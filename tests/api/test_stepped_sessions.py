@@ -785,11 +785,25 @@ def test_simulated_seconds_need_a_node_that_has_them(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ its end
 
 
-def test_a_block_that_fails_interrupts_the_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("error", "exit_code", "reason"),
+    [
+        (KeyError("gain"), 7, "the program failed: KeyError: 'gain'"),
+        (AssertionError(), 7, "the program failed: AssertionError"),
+        (KeyboardInterrupt(), 130, "ended by Ctrl+C"),
+    ],
+)
+def test_a_block_that_fails_ends_the_run_and_is_the_reason(
+    tmp_path: Path, error: BaseException, exit_code: int, reason: str
+) -> None:
     project = neuros.Project.from_file(cart(tmp_path))
-    with pytest.raises(ZeroDivisionError), project.session(backend="in-process") as s:
-        s.step(until=lambda s: s["robot.pose"].count and 1 / 0)
-    assert s.close().exit_code == 130
+    s = project.session(backend="in-process")
+    with pytest.raises(type(error)), s:
+        raise error
+    run = s.close()
+    assert (run.exit_code, run.reason) == (exit_code, reason)
+    with pytest.raises(RunError):
+        run.check()
 
 
 @pytest.mark.acceptance
