@@ -32,13 +32,12 @@ from neuros.project.loops import modules_beside
 from neuros.project.model import Project
 from neuros.project.parsed import apply_override
 from neuros.project.paths import NOT_COPIED, Roots
-from neuros.project.plugin_files import read_plugin
+from neuros.project.plugin_files import read_functions, read_plugin
 
 _PLAIN = (bool, int, float, complex, str, bytes, tuple, frozenset, type(None))
 _ADVICE = (
-    "nodes of this run are in other processes, so the functions have to come from a file: write"
-    ' them to one and give its path, plugin="brain.py", or use project.session(), which calls the'
-    " functions themselves"
+    "functions that run in another process, or stand in JSON, have to come from a file: write them"
+    ' to one and give its path, plugin="brain.py"'
 )
 
 
@@ -65,8 +64,7 @@ class PluginText:
         self._definitions: list[str] = []
         self._problems: dict[str, None] = {}
         self.beside: set[Path] = set()
-        files = (inspect.unwrap(each).__code__.co_filename for each in functions)
-        self._folders = {Path.cwd(), *(Path(file).parent for file in files)}
+        self._folders = {Path.cwd(), *(plugin.path.parent for plugin in read_functions(functions))}
         for function in functions:
             self._define(function)
         if self._problems:
@@ -97,7 +95,7 @@ class PluginText:
 
     def _define(self, value: Any) -> None:
         """Add the source of a function or class, behind what it needs."""
-        name, bare = value.__name__, inspect.unwrap(value)
+        name, bare = getattr(value, "__name__", ""), inspect.unwrap(value)
         if name in self._values:
             if self._values[name] is not value:
                 self._refuse(value, f"another '{name}' comes before it in the file")
@@ -144,7 +142,7 @@ class PluginText:
             if value.__name__ != name:
                 self._import(value, f"as {name}")
         elif name[:2] == "__":
-            self._refuse(user, f"it uses '{name}' of its module: node.resolve_path finds files")
+            self._refuse(user, f"it uses '{name}', which is another one in a file")
         elif isinstance(value, FunctionType | type) and is_own and value.__name__ == name:
             if id(value) not in self._hooks and hook_specs_of({"": value}):
                 self._refuse(user, f"it calls '{name}', a hook that the node does not have")
@@ -190,7 +188,7 @@ class PluginText:
                 self._copy(each.path)
 
     def _refuse(self, value: Any, why: str) -> None:
-        where = f"{value.__module__}.{getattr(value, '__qualname__', value.__name__)}"
+        where = f"{value.__module__}.{getattr(value, '__qualname__', value)}"
         self._problems[f"{where}: {why}"] = None
 
 

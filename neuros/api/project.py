@@ -292,11 +292,12 @@ class Project:
         is_held: bool = False,
     ) -> LiveRun:
         for node in project.nodes:
-            if node.hooks and options.deployment is not None:
+            if not node.hooks:
+                continue
+            if options.deployment is not None:
                 raise UsageError(
-                    f"deployment: the plugin of '{node.name}' is functions of this program, which"
-                    " other machines do not have: write the project with to_json(folder), and"
-                    " start that"
+                    f"deployment: other machines do not have the functions of '{node.name}': write"
+                    " the project with to_json(folder), and start that"
                 )
             PluginText(node.name, node.hooks)  # fails before there is a run folder
         plan = replace(make_plan(project, messages, options), is_held=is_held)

@@ -105,9 +105,7 @@ class PythonNode:
         keys = {k: {**v} if isinstance(v, Mapping) else {"type": v} for k, v in ports.items()}
         for name, of in keys.items():
             if "name" in of:
-                raise UsageError(
-                    f"{self!r}: {side}: the port '{name}' has a key 'name': leave it out"
-                )
+                raise UsageError(f"{self!r}: {side}: leave out the key 'name' of port '{name}'")
             if isinstance(of.get("type"), str):
                 of["type"] = in_full(of["type"])
         return [{"name": name, **of} for name, of in keys.items()]
@@ -272,10 +270,13 @@ def _all_of(given: Any, kind: type[_Part], name: str, shown: str) -> tuple[_Part
 
 
 def _json(name: str, content: Mapping[str, Any]) -> str:
-    try:
-        return json.dumps(content, default=_plain)
-    except (TypeError, ValueError, RecursionError) as error:
-        raise UsageError(f"{name}: {error}") from None
+    texts = []
+    for key, value in content.items():
+        try:
+            texts.append(f"{json.dumps(key)}: {json.dumps(value, default=_plain)}")
+        except (TypeError, ValueError, RecursionError) as error:
+            raise UsageError(f"{name}: {key}: {error}") from None
+    return f"{{{', '.join(texts)}}}"
 
 
 def _plain(value: Any) -> Any:

@@ -145,17 +145,18 @@ def plugins_of(node: Node) -> list[PluginFile]:
     Empty if the plugin cannot be read.
     """
     if node.hooks:
-        return _read_functions(node.hooks)
+        return read_functions(node.hooks)
     plugin = None if node.plugin == Path() else read_plugin(node.plugin)
     return [] if plugin is None else [plugin]
 
 
 def file_of(functions: Sequence[Callable[..., Any]]) -> Path:
     """The file of the first of the functions, which need not exist: they may be of a notebook."""
-    return next((plugin.path for plugin in _read_functions(functions)), Path())
+    return next((plugin.path for plugin in read_functions(functions)), Path())
 
 
-def _read_functions(functions: Sequence[Callable[..., Any]]) -> list[PluginFile]:
+def read_functions(functions: Sequence[Callable[..., Any]]) -> list[PluginFile]:
+    """The declarations of functions of this program, one for each file that they are in."""
     found: dict[str, PluginFile] = {}
     for spec in hook_specs_of(dict(enumerate(functions))):
         file, _, line = spec.where.rpartition(":")

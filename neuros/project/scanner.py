@@ -58,9 +58,9 @@ class Source:
         return line, position - self._line_starts[line - 1] + 1
 
     def problem(self, position: int, pointer: str, text: str, hint: str = "") -> Problem:
-        """A problem at a position; the whole document is shown as ``/``."""
+        """A problem at a position; the whole document of a file is shown as ``/``."""
         line, column = self.place(position)
-        return Problem(self.name, line, column, pointer or "/", text, hint)
+        return Problem(self.name, line, column, pointer or "/" * self.has_lines, text, hint)
 
 
 @dataclass
@@ -296,7 +296,8 @@ class _Scanner:
             hint = "JSON has no comments"
         elif rest[0] == "'":
             hint = "JSON has double quotes only"
-        raise SourceError(self._source.problem(position, pointer, f"syntax error: {text}", hint))
+        what = f"syntax error: {text}" if self._source.has_lines else text
+        raise SourceError(self._source.problem(position, pointer, what, hint))
 
 
 def place_of(file: Path, pointer: str) -> tuple[int, int]:
