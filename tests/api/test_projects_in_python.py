@@ -7,6 +7,8 @@ import json
 import json.decoder
 import math
 import pickle
+import re
+import runpy
 import subprocess
 import sys
 from collections.abc import Callable
@@ -40,6 +42,7 @@ from neuros.testing import PluginHarness
 
 ACCEPTANCE = pytest.mark.acceptance
 RUNS = pytest.mark.ros
+ROOT = Path(__file__).resolve().parents[2]
 LAST = 3
 HEAR = "from neuros.hooks import *\n@neuros_finalise()\ndef end(node): ...\n"
 TABLE = [1, 2]
@@ -154,7 +157,7 @@ def test_files_and_installed_modules_are_plugins_as_in_json(tmp_path: Path) -> N
     described = neuros.Project(nodes).check_with({})
     assert [node.plugin for node in described.nodes] == [tmp_path / "brain.py"] * 3
     for plugin in ("json.decoder", json.decoder):
-        with pytest.raises(ProjectError, match="json/decoder.py:1:1: declares no hooks"):
+        with pytest.raises(ProjectError, match=r"json/decoder\.py:1:1: declares no hooks"):
             neuros.Project([neuros.Node("one", plugin)])
 
 
@@ -552,6 +555,37 @@ def test_the_harness_refuses_what_is_no_hook() -> None:
         PluginHarness(undecorated)
     with pytest.raises(HookError, match="declares no input 'heard'"):
         PluginHarness(add_one)
+
+
+@RUNS
+def test_the_three_ways_of_the_page_are_the_project_of_the_readme(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("NEUROS_BACKEND", "in-process")
+    _, _, section = (ROOT / "docs/python.md").read_text("utf-8").partition("## Projects in Python")
+    in_python, in_harness = _blocks(section.partition("\n## ")[0], "python")
+    readme = (ROOT / "README.md").read_text("utf-8")
+    (plugin, *_), (content, *_) = _blocks(readme, "python"), _blocks(readme, "json")
+    (tmp_path / "count.py").write_text(plugin)
+    (tmp_path / "project.json").write_text(content)
+    # As a program would, the functions have their source from a file.
+    (tmp_path / "program.py").write_text(in_python + in_harness)
+    space = runpy.run_path("program.py")
+    out = capsys.readouterr().out
+    for printed in ("alice ended the project: that is enough", "[std_msgs.msg.Int32(data=1)]"):
+        assert f"{printed}\n" in out
+    from_json = neuros.Project.from_file(tmp_path)
+    made, launched = space["project"], neuros.Project.from_file(tmp_path / "count")
+    assert from_json.connections == made.connections == launched.connections
+    described = [each.check_with({}) for each in (from_json, made, launched)]
+    ports = [[(node.name, node.inputs, node.outputs) for node in each.nodes] for each in described]
+    assert ports[0] == ports[1] == ports[2]
+    assert plugin.partition("@")[2].strip() in in_python, "the functions are the same"
+    assert launched.run(check=True).reason in out
+
+
+def _blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
 
 
 # ------------------------------------------------------------------ ports without a connection
