@@ -25,7 +25,7 @@ from typing import Any
 from neuros.backends.containers import find_container
 from neuros.distribution import WORKSPACE
 from neuros.errors import UsageError
-from neuros.hooks import hook_specs_of
+from neuros.hooks import MARK, hook_specs_of
 from neuros.project.in_python import PythonProject, is_installed
 from neuros.project.load import PROJECT_FILE
 from neuros.project.loops import modules_beside
@@ -114,6 +114,8 @@ class PluginText:
         space = getattr(bare, "__globals__", None) or vars(sys.modules[bare.__module__])
         if around := getattr(getattr(bare, "__code__", None), "co_freevars", ()):
             self._refuse(value, f"it uses {_quoted(around)} of the function around it")
+        if isinstance(value, FunctionType) and (kept := vars(value).keys() - {MARK, "__wrapped__"}):
+            self._refuse(value, f"it has attributes, {_quoted(sorted(kept))}: keep user data")
         for code in _codes(bare):
             if code.co_flags & annotations.compiler_flag:
                 self._imports.setdefault("__future__", {})["annotations"] = None

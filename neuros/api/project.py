@@ -340,7 +340,7 @@ class Project:
         """
         known = self._warned | (loaded.unconnected if is_held else frozenset())
         frame, level, own = sys._getframe(), 1, own_packages()
-        while frame.f_back and frame.f_globals["__name__"].partition(".")[0] in own:
+        while frame.f_back and str(frame.f_globals.get("__name__")).partition(".")[0] in own:
             frame, level = frame.f_back, level + 1
         for warning in loaded.warnings:
             if warning not in known:

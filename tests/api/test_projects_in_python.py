@@ -142,10 +142,15 @@ def test_a_function_that_fails_is_named_with_its_line_in_the_plugin_of_the_run()
 
 
 @RUNS
-def test_a_session_steps_functions() -> None:
+def test_functions_run_in_the_background_and_in_sessions() -> None:
+    with talk().start(backend="in-process", record=True) as live:
+        run = live.wait()
+    assert [packet.data for packet in run.bag["alice.number -> bob.heard"]] == [0, 2]
     with talk().session(backend="in-process") as s:
-        s.step()
-        assert s["alice.number"].packet == Int32(data=2)
+        for _ in range(2):
+            s.step()
+            assert s["alice.number"].packet == Int32(data=2)
+            s.reset()
 
 
 def test_files_and_installed_modules_are_plugins_as_in_json(tmp_path: Path) -> None:
@@ -477,14 +482,19 @@ def test_what_cannot_stand_in_a_file_is_named() -> None:
     @neuros_function(inputs="heard")
     def twice(node: neuros.NodeHandle, heard: Any) -> None: ...  # type: ignore[no-redef]
 
+    @neuros_function(inputs="heard")
+    def remember(node: neuros.NodeHandle, heard: Any) -> None: ...
+
+    remember.last = 0  # type: ignore[attr-defined]
     unnamed = neuros_finalise()(lambda node: None)
-    hooks = [stop, first, twice, look_up, unnamed]
+    hooks = [stop, first, twice, remember, look_up, unnamed]
     project = talk(begin, *hooks)
     with pytest.raises(UsageError) as caught:
         project.run(backend="in-process", output="out")
     for text in (
         "stop: it uses 'limit' of the function around it",
         "twice: another 'twice' comes before it in the file",
+        "remember: it has attributes, 'last': keep",
         "look_up: it uses 'TABLE' (list, which changes): make it in an initialise hook",
         "look_up: it uses 'WEIGHTS' (ndarray): make it in an initialise hook",
         "look_up: it uses '__file__', which is another one in a file",

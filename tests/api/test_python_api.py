@@ -87,6 +87,7 @@ def test_a_run_gives_what_came_out(
     assert run.node_results["counter"] == {"sum": sum(thrown(7)), "eyes": thrown(7)}
     assert run.connections[EYES]["consumed"] == 10
     assert list(run.bag[EYES].array()["data"])[:10] == thrown(7)
+    assert [packet.data for packet in run.bag[EYES]][:10] == thrown(7)
     assert "counting" in run.log("counter")
     assert run.connection_frame().loc[EYES, "consumed"] == 10
     assert run.node_frame().loc["counter", "sum"] == sum(thrown(7))

@@ -46,10 +46,6 @@ from neuros.control.link import ControlLink
 from neuros.errors import ProjectError, RunError, UsageError
 from neuros.launcher.supervisor import Supervisor
 
-# The input that a test pushes the robot by.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*'(push|clock|wind)' of node '(robot|left)' is not connected"
-)
 ACCEPTANCE = pytest.mark.acceptance
 EVERY_BACK_END = [
     "in-process",
@@ -406,6 +402,7 @@ def test_a_wrong_packet_of_an_observer_is_refused_and_the_session_goes_on(
     assert "Traceback" not in log.read_text("utf-8")
 
 
+@pytest.mark.filterwarnings("ignore:.*'(push|clock)' of node 'robot' is not connected")
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_in_a_run_that_is_no_session_every_packet_of_an_observer_is_refused(
     tmp_path: Path, back_end: str
@@ -476,7 +473,6 @@ def test_a_free_run_ends_where_simulated_time_is_over(held: Session) -> None:
     assert held.sim_time == pytest.approx(end_s)
 
 
-@pytest.mark.filterwarnings("ignore:.*'clock' of node 'eye' is not connected")
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_a_free_run_ends_on_time_where_rounds_gain_different_times(
     tmp_path: Path, back_end: str
@@ -490,7 +486,6 @@ def test_a_free_run_ends_on_time_where_rounds_gain_different_times(
             assert s.sim_time == pytest.approx(end_s)
 
 
-@pytest.mark.filterwarnings("ignore:.*'clock' of node 'eye' is not connected")
 def test_in_process_no_round_of_a_free_run_begins_after_its_end(tmp_path: Path) -> None:
     with neuros.Project.from_file(eye(tmp_path, LEAPS)).session(backend="in-process") as s:
         assert s.run(duration_sim_s=2.0)
@@ -553,7 +548,6 @@ def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_f
         assert s["robot.pose"].count == 2
 
 
-@pytest.mark.filterwarnings("ignore:.*'image' of node 'brain' is not connected")
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_after_a_step_that_took_too_long_a_large_packet_and_a_large_answer_pass_each_other(
     tmp_path: Path, back_end: str
@@ -642,7 +636,6 @@ def test_after_a_step_that_took_too_long_who_waits_for_an_output_waits_for_the_r
         timer.join()
 
 
-@pytest.mark.filterwarnings("ignore:.*'image' of node 'eye' is not connected")
 def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_ending(
     tmp_path: Path,
 ) -> None:
@@ -668,7 +661,6 @@ def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_
     assert run.nodes["eye"]["report"] == "final"
 
 
-@pytest.mark.filterwarnings("ignore:.*of node 'seer' is not connected")
 @pytest.mark.parametrize("backend", ["in-process", "process"])
 def test_packets_that_are_sent_at_once_are_all_there_however_large(
     tmp_path: Path, backend: str

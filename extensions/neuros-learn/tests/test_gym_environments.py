@@ -175,10 +175,6 @@ def sensors(tmp_path: Path) -> Path:
     return tmp_path
 
 
-NOT_CONNECTED = pytest.mark.filterwarnings("ignore:.*of node 'robot' is not connected")
-
-
-@NOT_CONNECTED
 def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
     env = neuros.gym.make(
         sensors,
@@ -213,7 +209,6 @@ def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
         env.close()
 
 
-@NOT_CONNECTED
 @pytest.mark.parametrize(
     ("changed", "complaint"),
     [
@@ -245,7 +240,6 @@ def test_what_cannot_be_is_said_with_what_can(
 
 
 @pytest.mark.acceptance
-@NOT_CONNECTED
 def test_a_length_that_messages_do_not_have_is_said_with_that_they_have(sensors: Path) -> None:
     arguments = {"action": "robot.order", "observation": "robot.scan.data[7]", "reward": float}
     env = neuros.gym.make(sensors, **arguments)
@@ -257,7 +251,6 @@ def test_a_length_that_messages_do_not_have_is_said_with_that_they_have(sensors:
 
 
 @pytest.mark.acceptance
-@NOT_CONNECTED
 def test_a_project_that_waits_for_a_command_gets_one_at_each_reset(tmp_path: Path) -> None:
     def brain(**others: Any) -> gymnasium.Env[Any, Any]:
         return neuros.gym.make(
