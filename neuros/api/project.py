@@ -100,6 +100,7 @@ class Project:
         **keys: Any,
     ) -> None:
         self._open(PythonProject.of(nodes, connections, folder, keys), {})
+        self._warned.clear()
         self._warn(self._loaded, is_held=True)
 
     @classmethod
@@ -119,6 +120,7 @@ class Project:
             ProjectError: with all problems.
         """
         project = _project_of(Path(path).absolute(), set or {})
+        project._warned.clear()
         project._warn(project._loaded, is_held=True)
         return project
 
@@ -126,7 +128,7 @@ class Project:
         self.settings = dict(settings)
         self._source = source
         self._loaded = self._load()
-        self._warned: set[Problem] = set()
+        self._warned = {*self._loaded.warnings}  # a copy, as in another process, says nothing
         self.file = self._loaded.project.file
 
     @property
@@ -156,17 +158,22 @@ class Project:
             ProjectError: if the project is not valid with these values.
         """
         project = _project_of(self._source, {**self.settings, **settings})
-        project._warned = {*project._loaded.warnings} - project._loaded.unconnected
+        project._warned -= project._loaded.unconnected
         return project
 
-    def check_with(self, settings: Mapping[str, Any], seed: int | None = None) -> Described:
+    def check_with(
+        self, settings: Mapping[str, Any], seed: int | None = None, *, is_held: bool = False
+    ) -> Described:
         """Check the project as a run with these values does; returns its model.
+
+        Args:
+            is_held: whether it is for a session, which may use ports without a connection.
 
         Raises:
             ProjectError: with all problems.
             UsageError: if there is a seed, and no node has a variable for it.
         """
-        return self._load_for_run(StartOptions(set=settings, seed=seed), is_held=True)[0]
+        return self._load_for_run(StartOptions(set=settings, seed=seed), is_held=is_held)[0]
 
     def text(self) -> str:
         """The whole project as JSON, node files merged in."""

@@ -159,7 +159,7 @@ def test_files_and_installed_modules_are_plugins_as_in_json(tmp_path: Path) -> N
     module.__file__ = str(tmp_path / "brain.py")
     plugins = ["brain.py", Path("brain.py"), module]
     nodes = [neuros.Node(f"n{index}", plugin) for index, plugin in enumerate(plugins)]
-    described = neuros.Project(nodes).check_with({})
+    described = neuros.Project(nodes).check_with({}, is_held=True)
     assert [node.plugin for node in described.nodes] == [tmp_path / "brain.py"] * 3
     for plugin in ("json.decoder", json.decoder):
         with pytest.raises(ProjectError, match=r"json/decoder\.py:1:1: declares no hooks"):
@@ -424,7 +424,7 @@ def test_files_that_another_folder_would_lack_are_named(tmp_path: Path) -> None:
         project.to_json("out")
     Path("out").mkdir()
     (tmp_path / "out/world.xml").write_text("<mujoco/>")
-    made = neuros.Project.from_file(project.to_json("out")).check_with({})
+    made = neuros.Project.from_file(project.to_json("out")).check_with({}, is_held=True)
     assert made.node("one").environment["MODEL"] == str(tmp_path / "out/world.xml")
 
 
@@ -587,7 +587,7 @@ def test_the_three_ways_of_the_page_are_the_project_of_the_readme(
     from_json = neuros.Project.from_file(tmp_path)
     made, launched = space["project"], neuros.Project.from_file(tmp_path / "count")
     assert from_json.connections == made.connections == launched.connections
-    described = [each.check_with({}) for each in (from_json, made, launched)]
+    described = [each.check_with({}, is_held=True) for each in (from_json, made, launched)]
     ports = [[(node.name, node.inputs, node.outputs) for node in each.nodes] for each in described]
     assert ports[0] == ports[1] == ports[2]
     assert plugin.partition("@")[2].strip() in in_python, "the functions are the same"
@@ -629,6 +629,8 @@ def test_a_run_warns_of_it_once_and_where_the_program_calls(
         project.run(backend="in-process", duration="0.01")
     assert [each.filename for each in caught] == [__file__]
     project.run(backend="in-process", duration="0.01")
+    in_another_process = pickle.loads(pickle.dumps(project))
+    in_another_process.run(backend="in-process", duration="0.01")
 
 
 @RUNS
@@ -647,8 +649,8 @@ def test_other_warnings_come_at_once_and_point_to_the_program(
 
 
 def test_the_model_of_functions_is_not_in_json() -> None:
-    node: NodeOfModel = talk().check_with({}).node("alice")
+    node: NodeOfModel = talk().check_with({}, is_held=True).node("alice")
     assert node.hooks == (begin, add_one)
     assert node.plugin == Path(__file__)
     assert node.plugin_name == "begin, add_one"
-    assert "hooks" not in project_to_json(talk().check_with({}))["nodes"][0]
+    assert "hooks" not in project_to_json(talk().check_with({}, is_held=True))["nodes"][0]

@@ -126,7 +126,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
     ) -> None:
         check_length(rounds, sim_s)
         loaded = project if isinstance(project, Project) else Project.from_file(project)
-        described = loaded.check_with({})
+        described = loaded.check_with({}, is_held=True)
         self._reward, self._done = reward, done
         self._rounds, self._sim_s, self._initial_action = rounds, sim_s, initial_action
         self._has_seeds = bool(seeds(described.nodes))
