@@ -70,7 +70,7 @@ class PluginText:
         if self._problems:
             lines = "\n".join(f"node '{node}': {text}" for text in self._problems)
             raise UsageError(f"{lines}\n{_ADVICE}")
-        head = f'"""Plugin of node \'{node}\', written by NeuROS from functions of a program."""'
+        head = '"""Plugin that NeuROS has written from functions of a program."""'
         parts = ["\n".join(self._statements()), "\n".join(self._constants), *self._definitions]
         self.text = "\n\n".join([head, *filter(None, parts)]) + "\n"
 
@@ -215,11 +215,14 @@ def write_project(
         apply_override(parsed, text)
     contents = {PROJECT_FILE: parsed.root.plain}
     texts: dict[Path, PluginText] = {}
+    shared: dict[tuple[Callable[..., Any], ...], str] = {}  # nodes with the same functions
     for node, element, file in zip(project.nodes, parsed.nodes, source.files, strict=True):
         contents[file] = element.plain
         if node.hooks:
-            texts[folder / str(element.string("plugin"))] = PluginText(node.name, node.hooks)
-        elif not node.module:
+            file_name = shared.setdefault(node.hooks, contents[file]["plugin"])
+            contents[file]["plugin"] = file_name
+            texts[folder / file_name] = PluginText(node.name, node.hooks)
+        elif os.path.isabs(contents[file].get("plugin", "")):  # of a module of Python
             contents[file]["plugin"] = os.path.relpath(node.plugin, source.folder)
     if lacking := _lacking(source.folder, project, folder):
         raise UsageError(

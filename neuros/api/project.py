@@ -203,8 +203,8 @@ class Project:
     ) -> Path:
         """Write a project in Python as files that `neuros launch` runs; returns the project file.
 
-        These are ``project.json``, a file for each node and one for each plugin of functions, with
-        the settings of the project.
+        These are ``project.json``, a file for each node, and plugins of the functions; nodes with
+        the same functions share one. Settings of the project are in them.
 
         Args:
             folder: where; ``None``: the folder of the project. It is made if it does not exist.

@@ -391,13 +391,28 @@ def test_the_files_of_a_project_in_python_launch_as_they_are(tmp_path: Path) -> 
     file = talk(folder=tmp_path).to_json("made/here")
     assert file == tmp_path / "made/here/project.json"
     assert sorted(path.name for path in file.parent.iterdir()) == [
-        *("alice.json", "alice_plugin.py", "bob.json", "bob_plugin.py", "project.json")
+        *("alice.json", "alice_plugin.py", "bob.json", "project.json")
     ]
     done = launch(file, "--backend", "in-process", cwd=tmp_path)
     assert done.exit_code == 0, done.output
     assert "alice ended the project: that is enough" in done.output
     again = neuros.Project.from_file(file)
     assert (again.nodes, again.connections) == (talk().nodes, talk().connections)
+
+
+def test_plugins_that_are_files_keep_their_paths(tmp_path: Path) -> None:
+    for name in ("brain.py", "eye.py"):
+        (tmp_path / name).write_text(HEAR)
+    module = ModuleType("eye")
+    module.__file__ = str(tmp_path / "eye.py")
+    plugins = {"brain": "brain.py", "eye": module, "third": "@third.py"}
+    (tmp_path / "workspace").mkdir()
+    (tmp_path / "workspace/third.py").write_text(HEAR)
+    project = neuros.Project([neuros.Node(name, plugin) for name, plugin in plugins.items()])
+    file = project.to_json()
+    written = [json.loads(Path(f"{name}.json").read_text())["plugin"] for name in plugins]
+    assert written == ["brain.py", "eye.py", "@third.py"]
+    assert neuros.Project.from_file(file).text() == project.text()
 
 
 def test_settings_are_in_the_files(tmp_path: Path) -> None:
@@ -431,7 +446,7 @@ def test_files_that_another_folder_would_lack_are_named(tmp_path: Path) -> None:
 def test_a_plugin_file_has_what_its_functions_name() -> None:
     talk().to_json("out")
     text = Path("out/alice_plugin.py").read_text()
-    assert text.startswith('"""Plugin of node \'alice\'')
+    assert text.startswith('"""Plugin that NeuROS has written')
     for line in (
         "from __future__ import annotations",
         "import math",
