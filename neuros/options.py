@@ -26,6 +26,8 @@ from dataclasses import dataclass, field, fields, replace
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
+from neuros.project.suggest import did_you_mean
+
 _METADATA = "neuros option"
 _Arguments = ParamSpec("_Arguments")
 _Options = TypeVar("_Options")
@@ -174,10 +176,15 @@ def takes(
         def call(
             subject: _Subject, /, *arguments: _Arguments.args, **named: _Arguments.kwargs
         ) -> _Result:
+            for name in named.keys() - known:
+                hint = did_you_mean(name, known)
+                text = f"{function.__qualname__}() got an unexpected keyword argument '{name}'"
+                raise TypeError(f"{text} ({hint})" if hint else text)
             return function(subject, options(*arguments, **named))
 
         first, *_ = inspect.signature(function).parameters.values()
-        taken = inspect.signature(options).parameters.values()
+        known = inspect.signature(options).parameters
+        taken = known.values()
         call.__dict__["__signature__"] = inspect.Signature([first, *taken])
         described = []
         for each in options_of(options):

@@ -58,6 +58,7 @@ PACKAGES = (
     Package(4, ("visualise",)),
     Package(5, ("node",)),
     Package(5, ("launcher",)),
+    Package(6, ("runtime",)),
     Package(7, ("api",)),
     Package(7, ("testing",)),
     Package(8, ("pytest_plugin",)),
@@ -98,6 +99,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     }
     | MESSAGES,
     "transport.memory": set(),
+    "runtime": {"rclpy"},
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "snn": {"numpy"},
     "tf": {"geometry_msgs"},
@@ -108,6 +110,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "pytest_plugin": {"pytest"},
     "api.packets": {"numpy", "xxhash"},
     "api.run_record": {"tabulate"},
+    "api.session": {"numpy"},
     "api.verify": {"numpy", "xxhash"},
     "messages.package": {"catkin_pkg"},
     "messages.checking": {"rosidl_adapter"},

@@ -7,7 +7,6 @@ import importlib
 import os
 import shutil
 import socket
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,10 +22,11 @@ from neuros.api.run_folder import (
     make_run_folder,
     recording_of,
     removed_folders,
+    save_record,
     summary,
     write_node_files,
 )
-from neuros.api.run_record import broken_budgets, losses, run_record, run_table
+from neuros.api.run_record import EXIT_ENVIRONMENT, judge, run_record, run_table
 from neuros.backends.console import (
     LAYOUT,
     LogTail,
@@ -35,7 +35,7 @@ from neuros.backends.console import (
     format_record,
     wants_colours,
 )
-from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener
+from neuros.backends.control_sockets import UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
 from neuros.backends.reaper import Reaper
@@ -50,9 +50,7 @@ from neuros.options import recorded_values
 from neuros.ordinary_files import open_log
 from neuros.ports import Shown, View
 from neuros.recording.recording_plan import RecordingPlan
-from neuros.recording.run_file import RUN_FILE, write_run_file
 
-EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _ENDED_BY_SIGNAL = (130, 143)
 _PATIENCE_S = 1.0
 
@@ -148,8 +146,6 @@ class Execution:
             stack.callback(reaper.finish)
             for file in self._listener.files:
                 reaper.remove_later(file)
-            if self._plan.is_held:
-                reaper.remove_later(self.folder / SESSION_SOCKET_NAME)
             return self._run(reaper, started)
 
     def _run(self, reaper: Reaper, started: float) -> dict[str, Any]:
@@ -192,8 +188,13 @@ class Execution:
             if recording is not None and recorded is not None:
                 for problem in recording.report(recorded, record):
                     outcome.fail(problem, EXIT_ENVIRONMENT)
-            self._judge(record, outcome)
-            self._save(record, outcome)
+            was_drained = outcome.exit_code in (0, EXIT_ENVIRONMENT)
+            budgets, is_partial = self._plan.project.budgets, self._plan.is_partial
+            lost = judge(record, outcome, budgets, is_partial=is_partial)
+            if was_drained and outcome.late_drain and not lost:
+                text = "not drained in time, but no packet of a lossless connection was lost"
+                self._console.log("INFO", text)
+            save_record(record, outcome, self.folder, self._run_id)
         self._console.write("\n" + run_table(record) + "\n")
         for reason in outcome.failures:
             if reason != outcome.reason:
@@ -264,37 +265,6 @@ class Execution:
         path[CONTROL_VARIABLE] = self._listener.address
         messages = self._plan.messages
         return with_messages({**path, **self._environment()}, messages.paths if messages else ())
-
-    def _judge(self, record: dict[str, Any], outcome: Outcome) -> None:
-        """Fail a run that has lost packets of lossless connections, or has broken budgets."""
-        if outcome.exit_code in (0, EXIT_ENVIRONMENT):  # any other run was not drained
-            lost = losses(record)
-            for text in lost:
-                outcome.fail(text)
-            if outcome.late_drain and not lost:
-                self._console.log(
-                    "INFO", "not drained in time, but no packet of a lossless connection was lost"
-                )
-        broken = broken_budgets(
-            record, self._plan.project.budgets, is_partial=self._plan.is_partial
-        )
-        for text in broken:
-            outcome.fail(f"budget broken: {text}", EXIT_BUDGET)
-        record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
-        record["broken_budgets"] = broken
-
-    def _save(self, record: dict[str, Any], outcome: Outcome) -> None:
-        """Write ``run.json``; if the disk is full, into a folder for temporary files."""
-        try:
-            write_run_file(record, self.folder)
-        except OSError as error:
-            spare = Path(tempfile.gettempdir(), f"neuros-{self._run_id}")
-            problem = f"{self.folder / RUN_FILE} cannot be written ({error.strerror})"
-            outcome.fail(f"{problem}: it is in {spare} instead, if there is room", EXIT_ENVIRONMENT)
-            record |= {"exit_code": outcome.exit_code, "reason": outcome.reason}
-            with contextlib.suppress(OSError):
-                spare.mkdir(0o700)
-                write_run_file(record, spare)
 
     def _as_here(self, text: str) -> str:
         """A text of a node with the paths of this machine in it."""

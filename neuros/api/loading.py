@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import ast
+import json
 import os
 import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from difflib import get_close_matches
 from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 from neuros.api.plan import make_environments
 from neuros.backends.containers import BASE, OWN_FOLDER, find_container, why_no_container
@@ -28,7 +30,7 @@ from neuros.project.in_python import PythonProject
 from neuros.project.load import LoadedProject, load_project
 from neuros.project.loops import Loops, modules_beside
 from neuros.project.message_types import unknown_type
-from neuros.project.model import NETWORK_MODULE, Node, Project
+from neuros.project.model import MODEL_FIELDS, NETWORK_MODULE, Node, Project
 from neuros.project.paths import is_missing, modules_here, why_no_module
 from neuros.project.plugin_files import PluginFile, plugins_of
 from neuros.project.scanner import display_name, problem_in
@@ -96,6 +98,29 @@ def load_with_messages(
     return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
 
 
+def override_texts(settings: Mapping[str, Any] | Sequence[str] | None) -> tuple[str, ...]:
+    """Settings as texts of ``--set``: ``["nodes.a.environment.RATE=0.5"]``."""
+    if not isinstance(settings, Mapping):
+        return tuple(settings or ())
+    return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
+
+
+def value_text(path: str, value: Any) -> str:
+    """A value as text for ``--set``; ``None``, which removes the key, is empty.
+
+    Raises:
+        UsageError: if JSON has no such value.
+    """
+    if value is None:
+        return ""
+    if isinstance(value, str) and path.split(".")[2:3] == ["environment"]:
+        return value
+    try:
+        return json.dumps(value.tolist() if hasattr(value, "tolist") else value)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{path}: {error}") from error
+
+
 def seed_variables(project: Project, seed: int) -> dict[str, dict[str, str]]:
     """By node, the variables with SEED in their names in its environment, set to this seed.
 
@@ -109,6 +134,37 @@ def seed_variables(project: Project, seed: int) -> dict[str, dict[str, str]]:
             " name: add the one that its plugin reads to its environment"
         )
     return {name: dict.fromkeys(variables, str(int(seed))) for name, variables in found.items()}
+
+
+def with_model_fields(project: Project, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings for ``--set`` of settings that may name fields of a simulated model.
+
+    Those are ``robot.model.geom_friction``; they reach the node by a variable of its environment.
+
+    Raises:
+        UsageError: if there is no such node.
+    """
+    found: dict[str, Any] = {}
+    fields: dict[str, dict[str, Any]] = {}
+    nodes = {node.name: node for node in project.nodes}
+    for path, value in settings.items():
+        node, _, rest = path.partition(".")
+        kind, _, name = rest.partition(".")
+        if node == "nodes" or kind != "model" or not name:
+            found[path] = value
+        elif node in nodes:
+            fields.setdefault(node, {})[name] = getattr(value, "tolist", lambda v=value: v)()
+        else:
+            hint = did_you_mean(node, nodes) or f"it has {', '.join(nodes)}"
+            raise UsageError(f"'{path}': {project.name} has no node '{node}' ({hint})")
+    for node, values in fields.items():
+        try:
+            text = json.dumps(values, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            names = ", ".join(f"{node}.model.{name}" for name in values)
+            raise UsageError(f"{names}: give finite numbers, or arrays of them: {error}") from None
+        found[f"nodes.{node}.environment.{MODEL_FIELDS}"] = text
+    return found
 
 
 def _unknown_in_containers(project: Project, workspaces: Workspaces) -> Iterator[Problem]:

@@ -19,7 +19,7 @@ import sys
 import textwrap
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 from neuros.backends.containers import find_container
@@ -37,7 +37,8 @@ from neuros.project.plugin_files import read_functions, read_plugin
 _PLAIN = (bool, int, float, complex, str, bytes, tuple, frozenset, type(None))
 _ADVICE = (
     "functions that run in another process, or stand in JSON, have to come from a file: write them"
-    ' to one and give its path, plugin="brain.py"'
+    ' to one and give its path, plugin="brain.py"; project.session(backend="local") calls the'
+    " functions themselves"
 )
 
 
@@ -116,11 +117,12 @@ class PluginText:
             self._refuse(value, f"it uses {_quoted(around)} of the function around it")
         if isinstance(value, FunctionType) and (kept := vars(value).keys() - {MARK, "__wrapped__"}):
             self._refuse(value, f"it has attributes, {_quoted(sorted(kept))}: keep user data")
-        for code in _codes(bare):
-            if code.co_flags & annotations.compiler_flag:
-                self._imports.setdefault("__future__", {})["annotations"] = None
-                _remove_annotations(tree)
-        used, changed = _globals_of(ast.unparse(tree))
+        parts = vars(bare).values() if isinstance(bare, type) else [bare]
+        codes = (getattr(part, "__code__", None) for part in parts)
+        if any(code and code.co_flags & annotations.compiler_flag for code in codes):
+            self._imports.setdefault("__future__", {})["annotations"] = None
+            _remove_annotations(tree)
+        used, changed = globals_of(ast.unparse(tree))
         if set_here := sorted(changed & space.keys()):
             self._refuse(value, f"it sets the global {_quoted(set_here)}: keep it as user data")
         for each in sorted(used - {name} - set(around)):
@@ -139,7 +141,7 @@ class PluginText:
                 self._refuse(user, f"it uses another '{name}' than the function before")
         elif isinstance(value, ModuleType):
             self._values[name] = value
-            for module in _modules_in(name, value, tree):
+            for module in modules_in(name, value, tree):
                 self._import(module, "")
             if value.__name__ != name:
                 self._import(value, f"as {name}")
@@ -150,7 +152,7 @@ class PluginText:
                 self._refuse(user, f"it calls '{name}', a hook that the node does not have")
             else:
                 self._define(value)
-        elif (home := _home_of(value)) is not None:
+        elif (home := home_of(value)) is not None:
             self._values[name] = value
             module, its_name = home
             self._import(module, its_name if its_name == name else f"{its_name} as {name}")
@@ -265,7 +267,7 @@ def _is_same(target: Path, path: Path) -> bool:
     return target.exists() and target.samefile(path)
 
 
-def _globals_of(source: str) -> tuple[set[str], set[str]]:
+def globals_of(source: str) -> tuple[set[str], set[str]]:
     """The names in a source that are not its own, and those of them that it sets."""
     used: set[str] = set()
     changed: set[str] = set()
@@ -282,7 +284,7 @@ def _globals_of(source: str) -> tuple[set[str], set[str]]:
     return used, changed
 
 
-def _modules_in(name: str, module: ModuleType, tree: ast.Module) -> Iterator[ModuleType]:
+def modules_in(name: str, module: ModuleType, tree: ast.Module) -> Iterator[ModuleType]:
     """The modules that attributes of a name lead to, as ``matplotlib.pyplot`` does."""
     if module.__name__ == name:
         yield module
@@ -301,7 +303,7 @@ def _modules_in(name: str, module: ModuleType, tree: ast.Module) -> Iterator[Mod
                     yield found
 
 
-def _home_of(value: Any) -> tuple[ModuleType, str] | None:
+def home_of(value: Any) -> tuple[ModuleType, str] | None:
     """The module that a value can be imported from, the shortest, and its name there."""
     path, name = getattr(value, "__module__", None), getattr(value, "__name__", None)
     found = None
@@ -318,13 +320,6 @@ def _is_plain(value: Any) -> bool:
     if type(value) in (tuple, frozenset):
         return all(map(_is_plain, value))
     return type(value) in _PLAIN and (not isinstance(value, float) or value - value == 0)
-
-
-def _codes(value: Any) -> Iterator[CodeType]:
-    """The code of a function, or of the functions of a class."""
-    for each in vars(value).values() if isinstance(value, type) else [value]:
-        if code := getattr(each, "__code__", None):
-            yield code
 
 
 def _remove_annotations(tree: ast.Module) -> None:

@@ -7,13 +7,20 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.api.live import LiveRun
-from neuros.api.loading import foreseen_failures, load_with_messages, model_problems, seed_variables
+from neuros.api.loading import (
+    foreseen_failures,
+    load_with_messages,
+    model_problems,
+    override_texts,
+    seed_variables,
+    with_model_fields,
+)
 from neuros.api.plan import make_environments, make_plan
 from neuros.api.plugin_text import PluginText, write_project
 from neuros.api.request import Request
@@ -26,12 +33,12 @@ from neuros.project.in_python import PythonConnection, PythonNode, PythonProject
 from neuros.project.load import LoadedProject
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
-from neuros.registry import own_packages
+from neuros.registry import AUTO, own_packages
 
 if TYPE_CHECKING:
     from neuros.api.session import Session
 
-_ENVIRONMENT = "environment"
+LOCAL, IN_PROCESS = "local", "in-process"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,12 +62,45 @@ class RunOptions(StartOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class SessionOptions(StartOptions):
-    """The arguments of :meth:`Project.session`."""
+    """The arguments of :meth:`Project.session`: those of a start that make sense for it."""
 
+    nodes: Sequence[str] = field(init=False, default=())
+    network: bool = field(init=False, default=False)
+    peers: str | None = field(init=False, default=None)
+    peer_timeout: int | None = field(init=False, default=None)
+    duration: float | str | None = field(init=False, default=None)
+    placement: bool = field(init=False, default=True)
+    progress: bool | None = field(init=False, default=None)
+    backend: str | None = option(
+        default=LOCAL,
+        variable="NEUROS_BACKEND",
+        page="python.md#sessions",
+        help="run nodes in the thread of this program (local), or on a back end as `project.start`"
+        " does; if something is recorded or monitored, and for a deployment or an isolated run,"
+        " the default is auto",
+    )
+    expose: bool = option(
+        default=False,
+        page="python.md#sessions",
+        help="let ROS tools see the topics of nodes that are in the thread of this program",
+    )
     take_over: Sequence[str] = option(
         is_repeatable=True,
         help="inputs that the session feeds in the place of their connections: robot.wheels",
     )
+
+    def __post_init__(self) -> None:
+        asked = self.backend
+        super().__post_init__()
+        needs = ("record", "topics", "monitor_system_load", "deployment", "isolate")
+        given = [name for name in needs if getattr(self, name)]
+        if self.backend == LOCAL and given:
+            if asked == LOCAL:
+                raise UsageError(
+                    f"backend='local' with {', '.join(given)}: that needs a run in processes of its"
+                    " own, such as backend='in-process'"
+                )
+            object.__setattr__(self, "backend", AUTO)
 
 
 class Project:
@@ -252,31 +292,53 @@ class Project:
     def session(self, options: SessionOptions) -> Session:
         """Start a run that this program steps, and whose packets it reads and sends.
 
-        When this returns, initialise hooks have run, and no other hook.
+        When this returns, initialise hooks have run, and no other hook. By default, the nodes are
+        in the thread of this program: a hook that crashes the process, or never returns, is the
+        program's (see ``timeout_s`` of :meth:`Session.step`).
 
         Raises:
             ProjectError, UsageError, EnvironmentFault: as :meth:`run` does.
             RunError: if the run has ended already.
         """
-        from neuros.api.session import Session  # brings rclpy
-        from neuros.api.session_link import Held, with_session_inputs
+        from neuros.api.local_run import LocalRun  # brings rclpy
+        from neuros.api.session import Session
+        from neuros.api.session_link import Held, HeldRun, LaunchedRun, with_session_inputs
 
-        if options.nodes:
-            raise UsageError("nodes: a session holds all nodes of its project")
+        if options.expose and options.backend != LOCAL:
+            raise UsageError(
+                f"expose: ROS tools see the topics of the back end {options.backend} anyway"
+            )
         count = itertools.count(1)
 
-        def start(seed: int | None) -> Held:
-            number, output = next(count), None
-            if options.output is not None:  # out, out-2, out-3
-                output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
-            own = replace(options, seed=seed, output=output)
-            project, messages = self._load_for_run(own, is_held=True)
+        def prepare(seed: int | None, settings: Mapping[str, Any]) -> Callable[[], Held]:
+            wanted = options.set
+            if isinstance(wanted, Mapping):
+                wanted = with_model_fields(self._loaded.project, wanted)
+            given = [*override_texts(wanted), *override_texts(settings)]
+            chosen = replace(options, seed=seed, set=given)
+            project, messages = self._load_for_run(chosen, is_held=True)
             held, inputs = with_session_inputs(project, options.take_over)
-            live = self._live(held, messages, own, is_held=True)
-            live.begin()
-            return Held(live, project, frozenset(inputs), messages.paths)
 
-        return Session(start, options.seed)
+            def start() -> Held:
+                number, output = next(count), None
+                if options.output is not None:  # out, out-2, out-3
+                    output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
+                own = replace(chosen, output=output)
+                run: HeldRun
+                if options.backend == LOCAL:
+                    plan = make_plan(held, messages, replace(own, backend=IN_PROCESS))
+                    make_environments(plan.pythons, messages, sys.stderr)
+                    plan = replace(plan, request=own)
+                    run = LocalRun(plan, messages.paths, exposes=options.expose)
+                else:
+                    live = self._live(held, messages, own, is_held=True)
+                    live.begin()
+                    run = LaunchedRun(live, len(project.nodes))
+                return Held(run, project, frozenset(inputs), messages.paths)
+
+            return start
+
+        return Session(prepare, options.seed)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the path: the files are read again."""
@@ -331,7 +393,7 @@ class Project:
         loaded, messages = load_with_messages(self._source, texts, *names)
         if options.seed is not None:
             texts += [
-                f"nodes.{node}.{_ENVIRONMENT}.{name}={value}"
+                f"nodes.{node}.environment.{name}={value}"
                 for node, variables in seed_variables(loaded.project, options.seed).items()
                 for name, value in variables.items()
             ]
@@ -359,26 +421,3 @@ def _project_of(source: Path | PythonProject, settings: Mapping[str, Any]) -> Pr
     project = Project.__new__(Project)
     project._open(source, settings)
     return project
-
-
-def override_texts(settings: Mapping[str, Any] | Sequence[str] | None) -> tuple[str, ...]:
-    """Settings as texts of ``--set``: ``["nodes.a.environment.RATE=0.5"]``."""
-    if not isinstance(settings, Mapping):
-        return tuple(settings or ())
-    return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
-
-
-def value_text(path: str, value: Any) -> str:
-    """A value as text for ``--set``; ``None``, which removes the key, is empty.
-
-    Raises:
-        UsageError: if JSON has no such value.
-    """
-    if value is None:
-        return ""
-    if isinstance(value, str) and path.split(".")[2:3] == [_ENVIRONMENT]:
-        return value
-    try:
-        return json.dumps(value.tolist() if hasattr(value, "tolist") else value)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{path}: {error}") from error

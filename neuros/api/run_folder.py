@@ -19,16 +19,18 @@ import hashlib
 import json
 import os
 import platform
+import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neuros.api.plan import Plan
 from neuros.api.plugin_text import PluginText
+from neuros.api.run_record import EXIT_ENVIRONMENT
 from neuros.backends.reaper import Reaper
 from neuros.backends.sidecars import Recorded, RecorderProcess
 from neuros.distribution import WORKSPACE, __version__, python_command
@@ -37,6 +39,10 @@ from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_text, project_to_json
 from neuros.recording.provenance import seeds
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, plan_recording
+from neuros.recording.run_file import RUN_FILE, write_run_file
+
+if TYPE_CHECKING:
+    from neuros.launcher.outcome import Outcome
 
 LAUNCHER_LOG = "launcher.log"
 
@@ -92,8 +98,13 @@ def removed_folders(files: Sequence[NodeFile], run_folder: Path) -> list[str]:
     ]
 
 
-def write_node_files(plan: Plan, run_folder: Path) -> tuple[Plan, list[NodeFile]]:
+def write_node_files(
+    plan: Plan, run_folder: Path, *, keeps_functions: bool = False
+) -> tuple[Plan, list[NodeFile]]:
     """Write the expanded project, and for each node ``node.json`` and a plugin of functions.
+
+    Args:
+        keeps_functions: whether the nodes are in this program, and call the functions themselves.
 
     Returns:
         The plan with the files of these plugins, and the node files.
@@ -102,7 +113,8 @@ def write_node_files(plan: Plan, run_folder: Path) -> tuple[Plan, list[NodeFile]
         UsageError: if the folder cannot be written to, another run has begun there, or a function
             cannot stand in a file.
     """
-    texts = {node.name: PluginText(node.name, node.hooks) for node in plan.nodes if node.hooks}
+    of_functions = [node for node in plan.nodes if node.hooks and not keeps_functions]
+    texts = {node.name: PluginText(node.name, node.hooks) for node in of_functions}
     plugins = {name: run_folder / name / "plugin" / f"{name}_plugin.py" for name in texts}
     nodes = (
         replace(node, plugin=plugins[node.name], hooks=()) if node.name in plugins else node
@@ -140,6 +152,20 @@ def faults_of(run_folder: Path) -> Iterator[None]:
         raise UsageError(
             f"{run_folder} cannot be written to ({error.strerror}): name another folder with -o"
         ) from error
+
+
+def save_record(record: dict[str, Any], ended: Outcome, folder: Path, run_id: str) -> None:
+    """Write ``run.json``; if the disk is full, into a folder for temporary files."""
+    try:
+        write_run_file(record, folder)
+    except OSError as error:
+        spare = Path(tempfile.gettempdir(), f"neuros-{run_id}")
+        problem = f"{folder / RUN_FILE} cannot be written ({error.strerror})"
+        ended.fail(f"{problem}: it is in {spare} instead, if there is room", EXIT_ENVIRONMENT)
+        record |= {"exit_code": ended.exit_code, "reason": ended.reason}
+        with contextlib.suppress(OSError):
+            spare.mkdir(0o700)
+            write_run_file(record, spare)
 
 
 _PACKAGES = ("ros-jazzy-rclpy", "rosbags", "mujoco", "nest-simulator", "numpy")

@@ -17,6 +17,7 @@ from neuros.recording.run_file import FORMAT, RUN_FILE, read_object, read_run_fi
 if TYPE_CHECKING:
     from neuros.launcher.outcome import Outcome
 
+EXIT_ENVIRONMENT, EXIT_BUDGET = 4, 5
 _COUNTS = ("sent", "received", "consumed", "discarded", "lost")
 _STATES = ("executing", "waiting", "blocked", "idle")
 
@@ -281,6 +282,24 @@ def losses(record: Mapping[str, Any]) -> list[str]:
             )
         found.append(f"{name} is lossless (discard_limit 0), but {why}")
     return found
+
+
+def judge(
+    record: dict[str, Any], ended: Outcome, budgets: Budgets, *, is_partial: bool = False
+) -> list[str]:
+    """Fail a run that has lost packets of lossless connections, or has broken budgets.
+
+    Adds the end of the run to its record. Returns a sentence for each connection that lost packets.
+    """
+    # A run with another exit code was not drained.
+    lost = losses(record) if ended.exit_code in (0, EXIT_ENVIRONMENT) else []
+    for text in lost:
+        ended.fail(text)
+    broken = broken_budgets(record, budgets, is_partial=is_partial)
+    for text in broken:
+        ended.fail(f"budget broken: {text}", EXIT_BUDGET)
+    record |= {"exit_code": ended.exit_code, "reason": ended.reason, "broken_budgets": broken}
+    return lost
 
 
 def broken_budgets(

@@ -1,49 +1,46 @@
 """A run that a Python program holds in its hand: it steps the run, reads outputs and feeds inputs.
 
-The session is an observer on the control channel of the run, which stands paused from its start.
-Its inputs are external topics that are on no ROS graph: packets for them, like steps, go over the
-control channel, so a packet that is sent before a step is there when the step begins.
+The nodes live in the thread of the program (:mod:`neuros.api.local_run`), or in processes of their
+own: then the session is an observer on the control channel of the run, which stands paused from its
+start. Its inputs are external topics that are on no ROS graph. A packet that is sent before a step
+is there when the step begins.
 """
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import html
 import math
+import operator
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from types import TracebackType
 from typing import Any
 
-from neuros.api.loading import seed_variables
+import numpy as np
+
+from neuros.api.live import PROGRAM_FAILED, why_it_ended
+from neuros.api.loading import seed_variables, value_text, with_model_fields
 from neuros.api.run import Run
 from neuros.api.run_record import run_table
-from neuros.api.session_link import Held, SessionLink, connections_to, declared_at, port_of
-from neuros.backends.control_sockets import connect
-from neuros.control import (
-    TO_OBSERVERS,
-    AtRest,
-    LookAll,
-    Message,
-    NodeStatus,
-    Pause,
-    Reset,
-    Resume,
-    WasReset,
-    Watch,
+from neuros.api.session_link import (
+    Held,
+    connections_to,
+    declared_at,
+    port_of,
 )
-from neuros.control.link import ControlLink
-from neuros.errors import RunError, UsageError
+from neuros.control import AtRest, NodeStatus
+from neuros.errors import NeurosError, RunError, UsageError
+from neuros.node.instruments import MOST_PACKETS
 from neuros.project.graph import graph_svg
 from neuros.project.model import Node, Port
-from neuros.transport.messages import RosPackets, checked
+from neuros.transport.messages import checked
 
-_CONNECT_S = 0.01
 _READ_S = 1.0
 _MOST_ROUNDS_AT_REST = 1000
 _FINE = 1e-9
@@ -53,7 +50,7 @@ _MOST_VARIATION = 2.0
 class Session:
     """A run that stands still, but for the steps of this program::
 
-        with neuros.Project.from_file("project.json").session(backend="in-process") as s:
+        with neuros.Project.from_file("project.json").session() as s:
             while s["robot.imu"].packet is None:
                 s.step()
             s.send("robot.wheels", command)
@@ -61,43 +58,45 @@ class Session:
 
     A *round* lets each hook that drives the project start once, and lasts until nothing moves any
     more. Several threads may use it, one at a time. At the end of the block the run is ended,
-    drained; where the block fails, interrupted.
+    drained; where the block fails, it is ended at once.
 
     Attributes:
         folder: the run folder.
         runs: those that a reset has ended; each has a folder of its own.
     """
 
-    def __init__(self, start: Callable[[int | None], Held], seed: int | None) -> None:
-        self._start = start
+    def __init__(
+        self,
+        prepare: Callable[[int | None, Mapping[str, Any]], Callable[[], Held]],
+        seed: int | None,
+    ) -> None:
+        self._prepare = prepare
         self._seed = seed
-        self._packets = RosPackets()
         self._lock = threading.RLock()
-        self._newest: dict[str, tuple[int, bytes]] = {}
+        self._outputs: dict[str, _Received] = {}
         self.runs: list[Run] = []
-        self._hold(start(seed))
+        self._hold(prepare(seed, {})())
 
     def _hold(self, held: Held) -> None:
         """Take a run that has just been started."""
-        self._live, self._project, self._inputs = held.live, held.project, held.inputs
+        self._held, self._project, self._inputs = held.run, held.project, held.inputs
         self._ports: dict[str, tuple[Node, Port]] = {}  # of inputs, by name
-        self.folder = held.live.folder
+        self.folder = held.run.folder
         self._run: Run | None = None
         sys.path[:0] = [path for path in map(str, held.messages) if path not in sys.path]
+        self._begin_anew()
         try:
-            self._link = SessionLink(self._connect(), self.folder)
-            self._link.send(Watch())
-            self._begin()
+            self._take(held.run.begin(self._known))
         except BaseException:
-            held.live.end()
+            held.run.interrupt("the session could not begin", PROGRAM_FAILED)
             raise
 
-    def _begin(self) -> None:
-        """Forget packets and times, and wait until the initialise hooks have run."""
-        self._newest = dict.fromkeys(self._newest, (0, b""))
-        self._decoded: dict[str, tuple[int, Any]] = {}
+    def _begin_anew(self) -> None:
+        """Forget packets and times."""
+        for received in self._outputs.values():
+            received.begin_anew()
+        self._known = dict.fromkeys(self._outputs, 0)
         self._sim_times: Mapping[str, float] = {}
-        self._settle()
 
     # ------------------------------------------------------------------ time
 
@@ -113,7 +112,7 @@ class Session:
 
     def step(
         self,
-        rounds: int = 1,
+        rounds: int | None = None,
         *,
         sim_s: float | None = None,
         until: Callable[[Session], object] | None = None,
@@ -122,7 +121,7 @@ class Session:
         """Let the run go on by rounds, each until nothing moves any more.
 
         Args:
-            rounds: so many.
+            rounds: so many; one if no length is given.
             sim_s: in their place, as many as it takes for so many simulated seconds.
             until: or as many as it takes until ``until(session)`` is true; it is asked before.
             timeout_s: the longest time to wait, in wall seconds; ``None``: for ever.
@@ -134,22 +133,24 @@ class Session:
             RunError: if it has failed, or had ended before.
             TimeoutError: if it takes longer; what goes on is waited for by the next step, but not
                 by :meth:`send`, :meth:`state`, a :meth:`run` of wall time and :meth:`reset`. The
-                first look at an output waits for a second, then raises this error, too.
-            UsageError: for ``sim_s`` where no node owns simulated time, and for a length that is
-                negative or not finite.
+                first look at an output waits for a second, then raises this error, too. Where the
+                nodes are in the thread of this program, a hook that does not return is interrupted
+                a second later, which fails the run: the error says where it stood.
+            UsageError: for more than one length, for ``sim_s`` where no node owns simulated time,
+                and for a length that is no number, negative or not finite.
         """
-        check_length(rounds, sim_s)
-        end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        count = check_length(rounds, sim_s, until)
+        end_s = None if timeout_s is None else time.monotonic() + check_seconds(timeout_s=timeout_s)
         with self._lock:
             self._check_running()
-            if until is not None and self._link.is_behind and not self._advance(0, end_s):
+            if until is not None and self._held.is_behind and not self._advance(0, end_s):
                 return False
-            for _ in self._rounds(rounds, sim_s, until):
+            for _ in self._rounds(count, sim_s, until):
                 if not self._advance(1, end_s):
                     return False
         return True
 
-    async def astep(self, rounds: int = 1, **options: Any) -> bool:
+    async def astep(self, rounds: int | None = None, **options: Any) -> bool:
         """As :meth:`step`, for coroutines."""
         return await asyncio.to_thread(partial(self.step, rounds, **options))
 
@@ -164,71 +165,64 @@ class Session:
         Returns:
             As :meth:`step`, and raises what that raises.
         """
-        _check_seconds("duration_s", duration_s)
-        _check_seconds("duration_sim_s", duration_sim_s)
         if (duration_s is None) == (duration_sim_s is None):
             raise UsageError("run: give either duration_s or duration_sim_s")
         with self._lock:
             self._check_running()
             if duration_s is None:
-                return self._run_sim(float(duration_sim_s or 0.0))
-            self._link.send(Resume())
-            try:
-                with contextlib.suppress(TimeoutError):
-                    self._wait_for(lambda message: False, time.monotonic() + duration_s)
-            finally:
-                self._link.send(Pause())
-            return self._run is None and self._settle()
+                return self._run_sim(check_seconds(duration_sim_s=duration_sim_s))
+            duration_s = check_seconds(duration_s=duration_s)
+            return self._take(self._held.run_for(duration_s, self._known))
 
-    def reset(self, seed: int | None = None) -> None:
-        """Bring every node back to where it was when the session began, with a seed.
+    def reset(self, seed: int | None = None, *, set: Mapping[str, Any] | None = None) -> None:
+        """Bring every node back to where it was when the session began, with a seed and settings.
 
-        The same seed gives the same packets from then on. Where all nodes are in one process, and
-        nothing is recorded, they are loaded anew in it, or their ``@neuros_reset`` hooks run; else
-        the run is ended, drained, and a new one takes its place (see :attr:`runs`). A run that has
-        ended or failed can be reset, too.
+        The same seed and settings give the same packets from then on. Where all nodes are in one
+        process, and nothing is recorded, they are loaded anew in it, or their ``@neuros_reset``
+        hooks run; else the run is ended, drained, and a new one takes its place (see :attr:`runs`).
+        A run that has ended or failed can be reset, too.
 
         Args:
             seed: for every variable with SEED in its name in the environment of a node; ``None``:
                 that of before.
+            set: values that replace those of the project until the next reset, by path:
+                ``nodes.robot.environment.RATE``, or any other path of ``--set``; and fields of a
+                MuJoCo model: ``robot.model.geom_friction`` (of ``mujoco.MjModel``; a number for
+                all its values, or all of them in its shape).
 
         Raises:
-            UsageError: if there is a seed, and no node takes one.
+            UsageError: if there is a seed, and no node takes one; for a path that leads nowhere.
             ProjectError, EnvironmentFault, RunError: as for the start of a session.
         """
         with self._lock:
             seed = self._seed if seed is None else seed
-            variables = {} if seed is None else seed_variables(self._project, seed)
-            if not self._reset_in_place(variables):
+            settings = with_model_fields(self._project, set or {})
+            if not self._reset_in_place(seed, settings):
+                start = self._prepare(seed, settings)  # what is wrong ends no run
                 self.runs.append(self.close("the session was reset"))
-                self._hold(self._start(seed))
+                self._hold(start())
             self._seed = seed
 
-    def _reset_in_place(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def _reset_in_place(self, seed: int | None, settings: Mapping[str, Any]) -> bool:
         """Whether the nodes could be reset in their process."""
-        answers: list[WasReset] = []
-
-        def is_answer(message: Message) -> bool:
-            if isinstance(message, WasReset):
-                answers.append(message)
-            return bool(answers)
-
-        if self._run is not None or not self._has_come_to_rest():
-            return False
-        self._link.send(Reset(variables))
-        if not self._wait_for(is_answer, None):
-            self._check_running()
-        if answers[0].why_not:
-            return False
-        self._begin()
-        return True
-
-    def _has_come_to_rest(self) -> bool:
+        variables = {} if seed is None else seed_variables(self._project, seed)
+        names = [node.name for node in self._project.nodes]
+        for path, value in settings.items():
+            kind, _, rest = path.partition(".")
+            node, _, rest = rest.partition(".")
+            place, _, variable = rest.partition(".")
+            is_variable = kind == "nodes" and node in names and place == "environment"
+            if not (is_variable and variable) or value is None:
+                return False
+            variables.setdefault(node, {})[variable] = value_text(path, value)
         try:
-            # A round that was given up may go on for ever: it ends as a free run does.
-            return self.run(duration_s=0.0) if self._link.is_behind else self._advance(0)
+            if self._run is not None or not self._held.reset(variables):
+                return False
         except RunError:
             return False
+        self._begin_anew()
+        self._take(self._held.begin(self._known))
+        return True
 
     # ------------------------------------------------------------------ packets
 
@@ -236,6 +230,20 @@ class Session:
         """An output, ``robot.imu``. Raises ``UsageError`` if there is none of that name."""
         node, port = port_of(self._project, output, is_input=False)
         return SessionOutput(self, f"{node.name}.{port.name}", port)
+
+    def probe(self, output: str, *, every: int = 1) -> PacketProbe:
+        """Keep the packets of an output from now on, over resets, too.
+
+        Args:
+            every: each packet is kept that follows so many others: 1 keeps all, 10 each tenth one.
+        """
+        if every < 1:
+            raise UsageError(f"every={every}: give 1 or more packets")
+        found = self[output]
+        with self._lock:
+            probe = PacketProbe(found.name, found._port, every)
+            self._received(found.name)._probes.append((probe, partial(self._copy, found._port)))
+        return probe
 
     def send(self, input_name: str, message: Any) -> None:
         """Send a packet to an input that the project leaves free, or that was taken over.
@@ -250,8 +258,15 @@ class Session:
             RunError: if the run has ended.
         """
         if input_name not in self._ports:
-            self._ports[input_name] = port_of(self._project, input_name, is_input=True)
+            self._ports[input_name] = self._input(input_name)
         node, port = self._ports[input_name]
+        packet = checked(port, message)
+        with self._lock:
+            self._check_running()
+            self._held.deliver(node.name, port.name, packet)
+
+    def _input(self, input_name: str) -> tuple[Node, Port]:
+        node, port = port_of(self._project, input_name, is_input=True)
         name = f"{node.name}.{port.name}"
         if name not in self._inputs:
             feeding = " and ".join(connections_to(self._project, name))
@@ -260,11 +275,7 @@ class Session:
                 f' session(take_over="{name}"), or send to another;'
                 f" {declared_at(node)}"
             )
-        packet = checked(port, message)
-        content = self._packets.encode(packet)
-        with self._lock:
-            self._check_running()
-            self._link.deliver(node.name, port.name, content)
+        return node, port
 
     # ------------------------------------------------------------------ state
 
@@ -276,28 +287,19 @@ class Session:
         Raises:
             RunError: if the run has ended.
         """
-        found: dict[str, NodeStatus] = {}
-
-        def is_last(message: Message) -> bool:
-            if isinstance(message, NodeStatus):
-                found[message.node] = message
-            return len(found) == len(self._project.nodes)
-
         with self._lock:
             self._check_running()
-            if not self._link.is_behind:  # else a round goes on, perhaps for ever
-                self._advance(0)  # what was sent has arrived then
-            self._link.send(LookAll({}))
-            if not self._wait_for(is_last, None):
+            found = self._held.look()
+            if found is None:
+                self._end()
                 self._check_running()
-        return found
+        return {status.node: status for status in found or ()}
 
     def close(self, reason: str = "the session was closed") -> Run:
         """End the run, drained, and return what it has left behind; a second time the same."""
         with self._lock:
             if self._run is None:
-                self._link.leave_nodes()
-                self._live.stop(reason)
+                self._held.stop(reason)
                 self._end()
             assert self._run is not None
             return self._run
@@ -312,7 +314,7 @@ class Session:
         trace: TracebackType | None,
     ) -> None:
         if error is not None and self._run is None:
-            self._live.fail(error)
+            self._held.interrupt(*why_it_ended(error))
             self._end()
         self.close()
 
@@ -337,17 +339,6 @@ class Session:
 
     # ------------------------------------------------------------------ inside
 
-    def _connect(self) -> ControlLink:
-        while True:
-            try:
-                stream = connect(self._live.control_address)
-            except OSError:
-                with contextlib.suppress(TimeoutError):
-                    self._run = self._live.wait(_CONNECT_S)
-                    self._check_running()
-            else:
-                return ControlLink(stream, TO_OBSERVERS, "the supervisor")
-
     def _rounds(
         self, rounds: int, sim_s: float | None, until: Callable[[Session], object] | None
     ) -> Iterator[None]:
@@ -368,7 +359,7 @@ class Session:
     def _run_sim(self, duration_s: float) -> bool:
         """Grant many rounds at once, but none that is to begin after the end.
 
-        In one process the nodes know the end, too. Elsewhere a round is taken to gain twice as much
+        In one thread the nodes know the end, too. Elsewhere a round is taken to gain twice as much
         as the largest average so far, so a grant covers half of what is left, or less. Where rounds
         suddenly gain several times as much, some may begin after it.
         """
@@ -405,65 +396,103 @@ class Session:
         self, rounds: int, end_s: float | None = None, end_sim_s: float | None = None
     ) -> bool:
         """Go on by rounds, and wait until nothing moves; whether the run goes on."""
-        return self._note(self._link.advance(rounds, self._known, end_s, end_sim_s))
+        return self._take(self._held.advance(rounds, self._known, end_s, end_sim_s))
 
-    def _settle(self) -> bool:
-        """Wait until nothing moves, after what was said to the supervisor."""
-        return self._note(self._link.settle(self._known))
+    def _take(self, answer: AtRest | None) -> bool:
+        """Keep times and packets; whether the run goes on."""
+        if answer is None:
+            self._end()
+            self._check_well()
+            return False
+        self._sim_times = answer.sim_times
+        for name, (count, contents) in answer.packets.items():
+            self._outputs[name].add(count, contents)
+            self._known[name] = count
+        return True
 
-    @property
-    def _known(self) -> dict[str, int]:
-        return {name: number for name, (number, _) in self._newest.items()}
-
-    def _note(self, settled: AtRest | None) -> bool:
-        if settled is not None:
-            self._sim_times = settled.sim_times
-            self._newest.update(settled.packets)
-            return True
-        self._end()
-        assert self._run is not None
-        self._run.check()
-        return False
-
-    def _wait_for(self, is_wanted: Callable[[Message], bool], end_s: float | None) -> bool:
-        """As :meth:`SessionLink.wait_for`."""
-        if self._link.wait_for(is_wanted, end_s):
-            return True
-        self._end()
-        return False
-
-    def _newest_of(self, output: str, wait_s: float | None = _READ_S) -> tuple[int, bytes]:
-        """The newest packet of an output; number 0: there is none yet.
+    def _received(self, output: str, wait_s: float | None = _READ_S) -> _Received:
+        """What has come from an output.
 
         Args:
             wait_s: for so long at most, if a round was given up: it may go on for ever.
         """
         with self._lock:
-            if output not in self._newest:
-                self._check_running()
-                self._newest[output] = (0, b"")
+            received = self._outputs.get(output)
+            if received is None:
+                received = self._outputs[output] = _Received()
+                self._known[output] = 0
+                if self._run is not None:
+                    self._take_last(output, received)
                 end_s = None
-                if self._link.is_behind and wait_s is not None:
+                if self._held.is_behind and wait_s is not None:
                     end_s = time.monotonic() + wait_s
                 try:
-                    self._advance(0, end_s)
-                except TimeoutError:
-                    del self._newest[output]
+                    if self._run is None:
+                        self._advance(0, end_s)
+                except BaseException:
+                    del self._outputs[output], self._known[output]
                     raise
-            return self._newest[output]
+            return received
+
+    def _copy(self, port: Port, content: Any) -> Any:
+        return self._held.copy(port.type, content)
 
     def _end(self) -> None:
-        self._link.leave_nodes()
-        self._run = self._live.wait()
-        self._link.close()
+        self._run = self._held.wait()
+        for name, received in self._outputs.items():
+            self._take_last(name, received)
+
+    def _take_last(self, name: str, received: _Received) -> None:
+        """Keep the packets that came after the last answer."""
+        count, contents = self._held.last_packets(name)
+        if count > received.count:
+            received.add(count, contents[received.count - count :])
 
     def _check_running(self) -> None:
         if self._run is not None:
-            self._run.check()
+            self._check_well()
             raise RunError(f"the run has ended: {self._run.reason}", self._run.exit_code)
 
+    def _check_well(self) -> None:
+        """Raise ``RunError`` if the run has failed; its cause is the error of the node."""
+        assert self._run is not None
+        try:
+            self._run.check()
+        except NeurosError as error:
+            raise error from self._held.error
 
-@dataclass(frozen=True)
+
+class _Received:
+    """What a session has received of an output.
+
+    Attributes:
+        count: how many packets the output has sent.
+        newest: the content of the newest.
+        unread: contents since the program looked at them last, as many as there is room for.
+        dropped: how many packets the program could not read, because it looked too late.
+    """
+
+    def __init__(self) -> None:
+        self._probes: list[tuple[PacketProbe, Callable[[Any], Any]]] = []
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """The run is another one."""
+        self.count, self.newest = 0, None
+        self.unread: deque[Any] = deque(maxlen=MOST_PACKETS)
+        self.dropped = 0
+
+    def add(self, count: int, contents: Sequence[Any]) -> None:
+        """Packets have come; the last one is the newest of so many."""
+        lost = count - self.count - len(contents)
+        room = MOST_PACKETS - len(self.unread)
+        self.dropped += lost + max(0, len(contents) - room)
+        self.count, self.newest = count, contents[-1]
+        self.unread.extend(contents)
+        for probe, copy in self._probes:
+            probe._add(contents, lost, copy)
+
+
 class SessionOutput:
     """An output of a node, as a session sees it: ``session["robot.imu"]``.
 
@@ -471,26 +500,49 @@ class SessionOutput:
         name: of node and output.
     """
 
-    _session: Session
-    name: str
-    _port: Port
+    def __init__(self, session: Session, name: str, port: Port) -> None:
+        self._session = session
+        self.name = name
+        self._port = port
 
     @property
     def count(self) -> int:
         """How many packets it has sent."""
-        return self._session._newest_of(self.name)[0]
+        return self._session._received(self.name).count
 
     @property
     def packet(self) -> Any:
-        """The newest packet, a message of its type; ``None`` before the first."""
-        number, content = self._session._newest_of(self.name)
-        if not number:
-            return None
-        decoded = self._session._decoded
-        if decoded.get(self.name, (0,))[0] != number:
-            packet = self._session._packets.decode(self._port.type, content)
-            decoded[self.name] = number, packet
-        return decoded[self.name][1]
+        """The newest packet, a message of its type; ``None`` before the first.
+
+        It is the program's own: each look gives another copy.
+        """
+        received = self._session._received(self.name)
+        return self._session._copy(self._port, received.newest) if received.count else None
+
+    @property
+    def packets(self) -> list[Any]:
+        """The packets since this was looked at last, oldest first.
+
+        A session keeps the newest 1000 of an output, or 64 MB of them. What was dropped because it
+        was looked at too late is a Python warning, and counted by :attr:`dropped`.
+        """
+        received = self._session._received(self.name)
+        with self._session._lock:
+            contents = [*received.unread]
+            received.unread.clear()
+            dropped, received.dropped = received.dropped, 0
+        if dropped:
+            warnings.warn(
+                f"{self.name}: {dropped} packets were dropped: only the newest"
+                f" {len(contents)} are kept; look at `packets` more often, or use a probe",
+                stacklevel=2,
+            )
+        return [self._session._copy(self._port, content) for content in contents]
+
+    @property
+    def dropped(self) -> int:
+        """How many packets the next look at :attr:`packets` will miss."""
+        return self._session._received(self.name).dropped
 
     def wait(self, timeout_s: float | None = None) -> Any:
         """Step until it sends a further packet, and return that.
@@ -500,8 +552,8 @@ class SessionOutput:
             RunError: if the run ends before.
         """
         session = self._session
-        end_s = None if timeout_s is None else time.monotonic() + timeout_s
-        before = session._newest_of(self.name, timeout_s)[0]
+        end_s = None if timeout_s is None else time.monotonic() + check_seconds(timeout_s=timeout_s)
+        before = session._received(self.name, timeout_s).count
 
         def is_there(_: Session) -> bool:
             if self.count == before and end_s is not None and time.monotonic() >= end_s:
@@ -515,18 +567,89 @@ class SessionOutput:
     def __repr__(self) -> str:
         try:
             count = str(self.count)
-        except TimeoutError:
+        except (TimeoutError, RunError):
             count = "an unknown number of"
         return f"<{self.name}: {count} packets of {self._port.type}>"
 
 
-def check_length(rounds: int, sim_s: float | None) -> None:
-    """Refuse a length of a step that is no length; raises ``UsageError``."""
-    if rounds < 0:
-        raise UsageError(f"rounds={rounds}: give 0 or more")
-    _check_seconds("sim_s", sim_s)
+class PacketProbe:
+    """The packets of an output since :meth:`Session.probe`, oldest first.
+
+    Attributes:
+        name: of node and output.
+        packets: its packets, messages of their type.
+        dropped: how many came so fast, between two rounds, that they were not kept.
+    """
+
+    def __init__(self, name: str, port: Port, every: int) -> None:
+        self.name = name
+        self.packets: list[Any] = []
+        self.dropped = 0
+        self._type = port.type
+        self._every = every
+        self._count = 0
+
+    def __len__(self) -> int:
+        return len(self.packets)
+
+    def array(self, field: str) -> np.ndarray[Any, np.dtype[Any]]:
+        """One field of all packets, ``linear_acceleration.x``: an array, a row per packet.
+
+        Raises:
+            UsageError: if packets have no such field, or its lengths differ.
+        """
+        try:
+            rows = [np.asarray(operator.attrgetter(field)(packet)) for packet in self.packets]
+        except AttributeError:
+            raise UsageError(f"{self.name}: {self._type} has no field '{field}'") from None
+        if len({row.shape for row in rows}) > 1:
+            raise UsageError(f"{self.name}: the length of '{field}' differs from packet to packet")
+        return np.array(rows)
+
+    def _add(self, contents: Sequence[Any], lost: int, copy: Callable[[Any], Any]) -> None:
+        self.dropped += lost
+        for content in contents:
+            if self._count % self._every == 0:
+                self.packets.append(copy(content))
+            self._count += 1
+
+    def __repr__(self) -> str:
+        return f"<PacketProbe of {self.name}: {len(self)} packets of {self._type}>"
 
 
-def _check_seconds(name: str, seconds: float | None) -> None:
-    if seconds is not None and not 0 <= seconds < math.inf:
-        raise UsageError(f"{name}={seconds:g}: give 0 or more seconds")
+def check_length(
+    rounds: int | None, sim_s: float | None, until: Callable[[Session], object] | None = None
+) -> int:
+    """Refuse a length of a step that is no length; returns the number of rounds.
+
+    Raises:
+        UsageError: for it, and for more than one.
+    """
+    given = {"rounds": rounds, "sim_s": sim_s, "until": until}
+    names = [name for name, value in given.items() if value is not None]
+    if len(names) > 1:
+        raise UsageError(f"step: {' and '.join(names)} are lengths of one step: give one of them")
+    if until is not None and not callable(until):
+        raise UsageError(f"until={until!r}: give a function that takes the session")
+    if sim_s is not None:
+        check_seconds(sim_s=sim_s)
+    if rounds is None:
+        return 1
+    try:
+        count = operator.index(rounds)
+    except TypeError:
+        raise UsageError(f"rounds={rounds!r}: give a whole number") from None
+    if count < 0 or isinstance(rounds, bool):
+        raise UsageError(f"rounds={rounds!r}: give 0 or more")
+    return count
+
+
+def check_seconds(**named: Any) -> float:
+    """The value of the one argument, in seconds. Raises ``UsageError`` if it is no such number."""
+    ((name, seconds),) = named.items()
+    try:
+        if 0 <= float(seconds) < math.inf and not isinstance(seconds, bool | str):
+            return float(seconds)
+    except (TypeError, ValueError):
+        pass
+    raise UsageError(f"{name}={seconds!r}: give 0 or more seconds")

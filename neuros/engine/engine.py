@@ -20,7 +20,7 @@ from neuros.engine.hook import Hook, Source
 from neuros.engine.input_queue import Subscription
 from neuros.engine.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, State
 from neuros.engine.node_ports import Links, NodePorts, Output, PacketType, undeclared
-from neuros.engine.schedule import ExecutionLog, Lifecycle, Pause, Schedule, drives
+from neuros.engine.schedule import ExecutionLog, Lifecycle, Pause, Schedule
 from neuros.engine.send_window import SendWindow
 from neuros.engine.sim_clock import ClockSubscription
 from neuros.errors import HookError
@@ -276,7 +276,7 @@ class Engine:
     @property
     def is_driving(self) -> bool:
         """Whether it has hooks that start unasked, and so drive the project."""
-        return any(map(drives, tuple(self.all_hooks)))
+        return any(hook.drives for hook in tuple(self.all_hooks))
 
     @property
     def tick_start_ns(self) -> int:

@@ -26,6 +26,7 @@ class Hook:
         turn: grows in the order of priority: least recently executed first.
         candidates: of the whole node, the hooks that are enabled, due and have all inputs; each
             hook adds and removes itself.
+        drives: whether it starts again and again without a packet: a tick, or a main loop.
         executions: their number.
         busy_ns: their duration in all.
         ticks: the intervals between starts, of a hook with a period.
@@ -40,6 +41,7 @@ class Hook:
         "blocked",
         "busy_ns",
         "candidates",
+        "drives",
         "due_ns",
         "executions",
         "inputs",
@@ -62,6 +64,10 @@ class Hook:
         self.outputs = tuple(outputs[port.name] for port in spec.outputs)
         self._windows = tuple(window for output in self.outputs for window in output.windows)
         self._results = tuple((outputs[port.name], port.is_optional) for port in spec.outputs)
+        is_main_loop = all(port.is_optional for port in spec.inputs)
+        self.drives = spec.kind is HookKind.TICK or (
+            spec.kind is HookKind.FUNCTION and is_main_loop
+        )
         self.blocked = 0
         self.turn = 0
         self.candidates: set[Hook] = set()

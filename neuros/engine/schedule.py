@@ -329,7 +329,7 @@ class Pause:
         """Whether the pause lets a hook start now."""
         if not self.is_on or hook.spec.kind is HookKind.INITIALISE:
             return True
-        if self._limits_all or drives(hook):
+        if self._limits_all or hook.drives:
             return self._started.get(hook, 0) < self._granted
         return self._granted > 0 and all(port.has_waited(self._arrived) for port in hook.inputs)
 
@@ -352,17 +352,10 @@ class Pause:
         """Count the start of a hook in the pause."""
         self._end_standstill(now_ns)
         started = self._started[hook] = self._started.get(hook, 0) + 1
-        if drives(hook):
+        if hook.drives:
             self._arrived = self._arrivals()
         if hook.period_ns:
             hook.is_due = started < self._granted
-
-
-def drives(hook: Hook) -> bool:
-    """Whether a hook starts again and again without a packet: a tick, or a main loop."""
-    kind = hook.spec.kind
-    is_main_loop = all(port.is_optional for port in hook.spec.inputs)
-    return kind is HookKind.TICK or (kind is HookKind.FUNCTION and is_main_loop)
 
 
 class ExecutionLog:

@@ -386,7 +386,7 @@ class Settling:
         self._pause_s = 0.0
         self._due_s: float | None = None
         self._answers: dict[tuple[str, ...], control.AtRest] = {}
-        self._packets: dict[str, tuple[int, bytes]] = {}
+        self._packets: dict[str, tuple[int, list[bytes]]] = {}
         self._last: tuple[Counts, Counts] | None = None
         self._last_s = 0.0
 
@@ -412,7 +412,9 @@ class Settling:
         if answer.number != self._round or self._asker is None:
             return
         self._answers[answer.nodes] = answer
-        self._packets.update(answer.packets)
+        for output, (number, contents) in answer.packets.items():
+            _, before = self._packets.get(output, (0, []))
+            self._packets[output] = number, before + contents
         if {name for names in self._answers for name in names} == self._names:
             self._judge(self._asker)
 

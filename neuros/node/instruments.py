@@ -7,6 +7,7 @@ where they want something.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any, Protocol, TypeAlias
 
@@ -51,25 +52,83 @@ class Instrument(Protocol):
         """Add what looks at the packets of a tap, at once or for as long as it is asked for."""
 
 
-class NewestPackets:
-    """The newest packet of each output, serialised, for a session.
+MOST_PACKETS = 1000
+"""Of an output, a session can read so many packets at most."""
+_MOST_BYTES = 64_000_000
+
+
+class PacketHistory:
+    """The packets of one output, for a session: the newest, as many as there is room for.
+
+    The size of the first one tells how many.
 
     Attributes:
-        by_output: number, from 1, and content.
+        count: how many packets the output has sent.
+        packets: the newest of them.
     """
 
-    def __init__(self, encode: Callable[[Any], bytes]) -> None:
+    def __init__(self, size: int) -> None:
+        self.count = 0
+        self.packets: deque[Any] = deque(
+            maxlen=max(1, min(MOST_PACKETS, _MOST_BYTES // max(1, size)))
+        )
+
+    def newest(self, most_bytes: int) -> list[bytes]:
+        """The newest packets that have so many bytes together; the last one in any case."""
+        found: list[bytes] = []
+        for content in reversed(self.packets):
+            most_bytes -= len(content)
+            if found and most_bytes < 0:
+                break
+            found.append(content)
+        return found[::-1]
+
+    def since(self, number: int) -> list[Any]:
+        """The packets after the one of this number (from 1) that are still there."""
+        missing = self.count - number
+        if missing == 1:
+            return [self.packets[-1]]
+        return [*self.packets][-missing:] if missing > 0 else []
+
+
+class PacketHistories:
+    """What a session can read of a node.
+
+    Args:
+        encode: serialises a packet.
+        copy_of: the function that copies packets of a port, where the session is in the same
+            process; ``None``: packets are kept serialised.
+
+    Attributes:
+        by_output: the packets of each output that has sent one.
+    """
+
+    def __init__(
+        self,
+        encode: Callable[[Any], bytes],
+        copy_of: Callable[[Port], Callable[[Any], Any]] | None = None,
+    ) -> None:
         self._encode = encode
-        self.by_output: dict[str, tuple[int, bytes]] = {}
+        self._copy_of = copy_of
+        self.by_output: dict[str, PacketHistory] = {}
 
     def attach(self, tap: Tap) -> None:
         """Keep what passes there, if it is an output."""
-        if tap.way is Way.SENT:
-            tap.add(lambda packet, data: self._keep(tap.name, packet, data))
+        if tap.way is not Way.SENT:
+            return
+        encode, copy = self._encode, self._copy_of and self._copy_of(tap.port)
+        by_output, name = self.by_output, tap.name
 
-    def _keep(self, output: str, packet: Any, data: bytes | None) -> None:
-        count = self.by_output.get(output, (0, b""))[0]
-        self.by_output[output] = (count + 1, data or self._encode(packet))
+        def keep(packet: Any, data: bytes | None) -> None:
+            content = copy(packet) if copy else data or encode(packet)
+            history = by_output.get(name)
+            if history is None:
+                size = len(encode(packet) if copy else content)
+                history = by_output[name] = PacketHistory(size)
+            history.count += 1
+            history.packets.append(content)
+
+        tap.add(keep)
 
 
 class NodeRecorder:

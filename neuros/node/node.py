@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neuros.control import Finalising, Message, Progress, Ready, Shutdown
+from neuros.control import AtRest, Finalising, Message, Progress, Ready, Shutdown
+from neuros.control.link import to_bytes
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
@@ -20,7 +22,7 @@ from neuros.hooks import HookKind, HookSpec, hook_specs_of
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices, Results
-from neuros.node.instruments import Instrument, NewestPackets, NodeRecorder, Tap
+from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Tap
 from neuros.node.logs import WorldLog
 from neuros.node.plugin import describe, last_line, load_plugin
 from neuros.node.reports import NodeReports
@@ -28,6 +30,10 @@ from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
 from neuros.ports import Middleware, PacketRecorder, Transport, Way
 from neuros.project.model import Connection, NodeFile, Port
+
+LAST_PACKETS = "last_packets"
+"""In the folder of a node of a session: its newest packets, when the run has ended."""
+_MOST_SAVED_BYTES = 1_000_000
 
 
 class NodeRuntime:
@@ -44,11 +50,12 @@ class NodeRuntime:
         on_initialised: called after each initialise hook.
         clock: monotonic clock in nanoseconds.
         make_engine: the engine, called like its class.
-        is_held: whether hooks stand still from the start, as paused, and the newest packet of each
-            output is kept.
+        is_held: whether hooks stand still from the start, as paused, and the newest packets of each
+            output are kept.
+        is_local: whether the session that holds it is in the same thread.
 
     Attributes:
-        newest: the newest packets, where they are kept.
+        histories: the newest packets, where they are kept.
         engine: ``None`` until :meth:`load`.
         specs: the hooks of its plugin, once that is loaded; after a reset, those that hold then.
         handle: the ``node`` that hooks receive.
@@ -71,6 +78,7 @@ class NodeRuntime:
         clock: Callable[[], int] = time.monotonic_ns,
         make_engine: Callable[..., Engine] = Engine,
         is_held: bool = False,
+        is_local: bool = False,
     ) -> None:
         self.file = file
         self.name = file.node.name
@@ -84,10 +92,11 @@ class NodeRuntime:
         self._tell = tell
         self._contexts = contexts
         environment = self._environment({})
-        # Functions of the program share its modules: none is private to the node.
-        plugin = None if file.node.module or file.node.hooks else file.node.plugin
-        own = Path() if file.node.hooks else file.folders.project
-        self._context = contexts.make_context(environment, plugin, own, log_file)
+        are_functions = bool(file.node.hooks)
+        plugin = None if file.node.module or are_functions else file.node.plugin
+        self._context = contexts.make_context(
+            *(environment, plugin, file.folders.project, log_file), shares_modules=are_functions
+        )
         self._enter = partial(contexts.enter, self._context)
         self._enter()
         self._transport = middleware.transport(file)
@@ -115,10 +124,12 @@ class NodeRuntime:
                 recorder, middleware.packets.encode, lambda: self._time.now_s, self._logger
             )
             instruments.append(self._recorder)
-        self._is_held = is_held
-        self.newest = NewestPackets(middleware.packets.encode)
+        self._is_held, self._is_local = is_held, is_local
+        packets = middleware.packets
+        copy_of = (lambda port: packets.copier(port.type)) if is_local else None
+        self.histories = PacketHistories(packets.encode, copy_of)
         if is_held:
-            instruments.append(self.newest)
+            instruments.append(self.histories)
         self._effects = NodeEffects(
             middleware,
             self._transport,
@@ -233,11 +244,12 @@ class NodeRuntime:
             self._services.close()
             self.handle.set_user_data(None)
         environment = self._environment(variables)
-        self._contexts.renew(self._context, environment, forgets_modules=not is_kept)
+        forgets = not is_kept and not self.file.node.hooks
+        self._contexts.renew(self._context, environment, forgets_modules=forgets)
         self._enter()
         self._time.begin_anew(keeps_owner=is_kept)
         self._services.results.clear()
-        self.newest.by_output.clear()
+        self.histories.by_output.clear()
         if is_kept:
             self.specs = [
                 replace(spec, kind=HookKind.INITIALISE) if spec.kind is HookKind.RESET else spec
@@ -282,6 +294,8 @@ class NodeRuntime:
         if runs_hooks and self.engine is not None:
             self._finalise_hooks(lambda name: self._tell(Finalising(self.name, name)))
         self._tell(Finalising(self.name, ""))
+        if self._is_held and not self._is_local:
+            self._save_packets()
         if self._recorder is not None:
             self._recorder.close()
         self._services.close()
@@ -308,27 +322,21 @@ class NodeRuntime:
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
 
     def deliver(self, input_name: str, data: bytes) -> None:
-        """A session sends a packet to one of its inputs.
-
-        Raises:
-            ControlError: if it is none of them.
-            ProtocolError: if the bytes are no message of its type.
-        """
-        port = next((p for p in self.file.node.inputs if p.name == input_name), None)
-        if port is None or port.external_topic is None:
-            raise ControlError(f"a packet came for '{self.name}.{input_name}', no session's input")
-        self.on_external_packet(port, self._middleware.packets.decode(port.type, data))
-
-    def deliver_if_right(self, input_name: str, data: bytes) -> None:
         """An observer sends a packet to an input of the session.
 
         What is none is refused in the log: an observer ends no run by a mistake.
         """
         try:
-            self.deliver(input_name, data)
+            port = next((p for p in self.file.node.inputs if p.name == input_name), None)
+            if port is None or port.external_topic is None:
+                text = f"a packet came for '{self.name}.{input_name}', no session's input"
+                raise ControlError(text)
+            packet = self._middleware.packets.decode(port.type, data)
         except (ControlError, ProtocolError, ValueError) as error:
             self._enter()  # the log is that of its own
             self._logger.warning(f"a packet for input '{input_name}' is refused: {error}")
+        else:
+            self.on_external_packet(port, packet)
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """The receiver of a connection has started on packets."""
@@ -373,6 +381,15 @@ class NodeRuntime:
             self.engine.pause()
         self._time.clock = self.engine.sim_clock
         return self.engine
+
+    def _save_packets(self) -> None:
+        """Leave the newest packets for a session, which may want to see what led to the end."""
+        packets = {
+            f"{self.name}.{output}": (history.count, history.newest(_MOST_SAVED_BYTES))
+            for output, history in self.histories.by_output.items()
+        }
+        with suppress(OSError):  # a full disk is reported by what loses more by it
+            (self.run_dir / LAST_PACKETS).write_bytes(to_bytes(AtRest(0, {}, packets)))
 
     def _finalise_hooks(self, begin: Callable[[str], object] = lambda _: None) -> None:
         for spec in self.specs:

@@ -27,6 +27,8 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _NO_NAMES = Names()
 _KEYS_OF_TRANSPORT = ("compression", "quality")
 FINALISE_S = 5.0
+MODEL_FIELDS = "NEUROS_MODEL_FIELDS"
+"""A variable of nodes with a simulator: fields of its model, by name, as a JSON object."""
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 _UNITS = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30}
 

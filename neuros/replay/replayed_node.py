@@ -33,9 +33,9 @@ from neuros.node.node import NodeRuntime
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
 from neuros.replay.recorded_node import RecordedNode
+from neuros.runtime.null_middleware import HeldLoop, NullMiddleware
 from neuros.transport.envelope import Traffic
 from neuros.transport.messages import RosPackets
-from neuros.transport.null_middleware import HeldLoop, NullMiddleware
 
 _POLL_S = 0.1
 _DEBUGPY_HOST = "127.0.0.1"

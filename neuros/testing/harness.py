@@ -35,9 +35,9 @@ from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.project.paths import find_module, is_module_name
 from neuros.project.plugin_files import file_of
+from neuros.runtime.local import Record
 from neuros.testing.stand_ins import (
     ManualClock,
-    Record,
     StepLoop,
     Topics,
     Workbench,
@@ -317,8 +317,7 @@ class PluginHarness:
         bench = Workbench(self._loop, self._topics, self.log)
         self._ends = Neighbours(file, bench.hub)
         self._contexts = ContextSwitch()
-        if not node.hooks:
-            self._contexts.hide_from_nodes(file.folders.project)
+        self._contexts.hide_from_nodes(file.folders.project)
         (file.folders.run / file.node.name).mkdir(parents=True, exist_ok=True)
         with self._in_context():
             self._runtime = NodeRuntime(

@@ -1,31 +1,26 @@
-"""Stand-ins for ROS in tests of plugins: node, logger, transport, event loop and clock."""
+"""The local runtime for tests of plugins: a clock that stands still, and a node without ROS."""
 
 from __future__ import annotations
 
-import logging
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 from neuros.errors import NodeError
-from neuros.ports import Inbox, Transport
+from neuros.ports import Inbox
 from neuros.project.message_types import in_full, normalised
 from neuros.project.model import Connection, Node, NodeFile, Port, Value
-from neuros.transport.lean_node import Parameter, ParameterNotDeclaredException
-from neuros.transport.memory import MemoryHub, MemoryTransport
-from neuros.transport.messages import RosPackets, copy_packet
-from neuros.transport.null_middleware import WithoutPeers
+from neuros.runtime.local import (
+    LocalLogger,
+    LocalLoop,
+    LocalMiddleware,
+    LocalRosNode,
+    Record,
+    log_in_python,
+)
+from neuros.transport.messages import copy_packet
 
-Event = Callable[[], None]
-_LEVELS = {
-    "DEBUG": logging.DEBUG,
-    "INFO": logging.INFO,
-    "WARN": logging.WARNING,
-    "ERROR": logging.ERROR,
-    "FATAL": logging.CRITICAL,
-}
 _NOTHING: Mapping[str, Value] = MappingProxyType({})
 
 
@@ -39,115 +34,20 @@ class ManualClock:
         return self.now_ns
 
 
-class StepLoop:
-    """Handles events in the order of posting (:class:`neuros.ports.EventLoop`).
-
-    All packets go through this one queue, so a loop-back arrives after all waiting events without a
-    queue of its own.
-    """
-
-    has_taken_in = True
+class StepLoop(LocalLoop):
+    """The loop of the runtime, with a clock that a test advances."""
 
     def __init__(self, clock: ManualClock) -> None:
-        self._clock = clock
-        self._events: deque[Event] = deque()
-        self._timers: list[tuple[Callable[[], int | None], Event]] = []
-        self._is_stopping = False
-
-    @property
-    def has_waiting_events(self) -> bool:
-        return bool(self._events)
-
-    def post(self, event: Event) -> None:
-        """Handle ``event`` after all waiting events; callable from any thread."""
-        self._events.append(event)
-
-    post_loop_back = post_from_thread = post
-
-    def note_execution(self) -> None:
-        """Nothing arrives during an execution."""
-
-    def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
-        """Call ``on_due`` when :meth:`advance_to` reaches ``next_due_ns()``."""
-        self._timers.append((next_due_ns, on_due))
-
-    @property
-    def next_due_ns(self) -> int | None:
-        """The time of the next timer, or ``None``."""
-        dues = [due for next_due_ns, _ in self._timers if (due := next_due_ns()) is not None]
-        return min(dues, default=None)
+        super().__init__(clock)
+        self._manual = clock
 
     def advance_to(self, time_ns: int) -> None:
-        """Set the clock, and run the timers that are due."""
-        self._clock.now_ns = time_ns
-        for next_due_ns, on_due in self._timers:
-            due_ns = next_due_ns()
-            if due_ns is not None and due_ns <= time_ns:
-                on_due()
-
-    def step(self) -> bool:
-        """Handle the oldest event; returns False if there was none."""
-        if self._is_stopping or not self._events:
-            return False
-        self._events.popleft()()
-        return True
-
-    def run(self) -> None:
-        """Handle events until none is left, or until :meth:`stop`."""
-        while self.step():
-            pass
-
-    def stop(self) -> None:
-        """Handle no further event."""
-        self._is_stopping = True
+        """Advance the clock, and call the timers that are due."""
+        self._manual.now_ns = time_ns
+        self.run_due_timers()
 
 
-class Record(NamedTuple):
-    """A line of a node's log; ``severity`` is DEBUG, INFO, WARN, ERROR or FATAL."""
-
-    severity: str
-    text: str
-
-
-class RecordingLogger:
-    """A stand-in for rclpy's logger that keeps every record, and passes it on to ``logging``.
-
-    ``once``, ``skip_first`` and ``throttle_duration_sec`` are accepted and have no effect.
-    """
-
-    def __init__(self, name: str, records: list[Record]) -> None:
-        self.name = name
-        self._records = records
-        self._python = logging.getLogger(f"neuros.{name}")
-
-    def get_child(self, name: str) -> RecordingLogger:
-        """A child logger with the same list of records."""
-        return RecordingLogger(f"{self.name}.{name}", self._records)
-
-    def debug(self, message: str, **_: Any) -> bool:
-        return self._keep("DEBUG", message)
-
-    def info(self, message: str, **_: Any) -> bool:
-        return self._keep("INFO", message)
-
-    def warning(self, message: str, **_: Any) -> bool:
-        return self._keep("WARN", message)
-
-    warn = warning
-
-    def error(self, message: str, **_: Any) -> bool:
-        return self._keep("ERROR", message)
-
-    def fatal(self, message: str, **_: Any) -> bool:
-        return self._keep("FATAL", message)
-
-    def _keep(self, severity: str, message: str) -> bool:
-        self._records.append(Record(severity, str(message)))
-        self._python.log(_LEVELS[severity], "%s", message)
-        return True
-
-
-class RosNodeStandIn:
+class RosNodeStandIn(LocalRosNode):
     """The result of ``node.get_ros_node()`` in a test: name, logger and parameters, without ROS.
 
     Args:
@@ -157,22 +57,12 @@ class RosNodeStandIn:
     def __init__(
         self,
         name: str,
-        records: list[Record],
+        logger: LocalLogger,
         parameters: Mapping[str, Value] = _NOTHING,
         topics: Mapping[str, tuple[str, int, int]] = MappingProxyType({}),
     ) -> None:
+        super().__init__(name, logger, parameters, _refuse)
         self._topics = topics
-        self._name = name
-        self._parameters: dict[str, Any] = dict(parameters)
-        self._given = {*parameters}
-        self._logger = RecordingLogger(name, records)
-
-    def get_name(self) -> str:
-        return self._name
-
-    def get_logger(self) -> RecordingLogger:
-        """The logger whose records are ``harness.log``."""
-        return self._logger
 
     def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
         """The topics of the node's own ports."""
@@ -185,28 +75,12 @@ class RosNodeStandIn:
     def count_subscribers(self, name: str) -> int:
         return self._topics[name][2]
 
-    def has_parameter(self, name: str) -> bool:
-        return name in self._parameters
 
-    def get_parameter(self, name: str) -> Parameter:
-        """A parameter that the project, or the plugin, has declared."""
-        if name not in self._parameters:
-            raise ParameterNotDeclaredException(name)
-        return Parameter(name, value=self._parameters[name])
-
-    def declare_parameter(self, name: str, value: Any = None, *_: Any, **__: Any) -> Parameter:
-        """Declare a parameter as in rclpy; a value of the project wins."""
-        if name not in self._given:
-            self._parameters[name] = value
-        return self.get_parameter(name)
-
-    def __getattr__(self, attribute: str) -> Any:
-        if attribute.startswith("__"):  # copy and pickle look for such attributes
-            raise AttributeError(attribute)
-        raise NodeError(
-            f"get_ros_node().{attribute}: there is no ROS behind a PluginHarness, only"
-            " get_logger(), get_name() and parameters: test this part in a project that is launched"
-        )
+def _refuse(attribute: str) -> Any:
+    raise NodeError(
+        f"get_ros_node().{attribute}: there is no ROS behind a PluginHarness, only"
+        " get_logger(), get_name() and parameters: test this part in a project that is launched"
+    )
 
 
 class Topics:
@@ -239,30 +113,27 @@ class Topics:
         self.inbox = None
 
 
-class Workbench(WithoutPeers):
+class Workbench(LocalMiddleware):
     """The middleware of one node under test (:class:`neuros.ports.Middleware`)."""
 
     def __init__(self, loop: StepLoop, topics: Topics, log: list[Record]) -> None:
-        self.loop = loop
-        self.topics = topics
-        self.packets = RosPackets()
-        self.hub = MemoryHub(loop, self.packets.copier)
-        self._log = log
-        self._ros_nodes: dict[str, RosNodeStandIn] = {}
+        def write(name: str, record: Record) -> None:
+            log.append(record)
+            log_in_python(name, record)
 
-    def transport(self, file: NodeFile) -> Transport:
-        """The transport of nodes that share a process, as in runs."""
-        self._ros_nodes[file.node.name] = RosNodeStandIn(
-            file.node.name, self._log, file.node.parameters, _topics_of(file)
-        )
-        return MemoryTransport(file, self.hub, self.topics)
+        super().__init__(loop, write, _raise)
+        self._topics = topics
 
-    def ros_node(self, file: NodeFile) -> RosNodeStandIn:
-        """The node's stand-in."""
-        return self._ros_nodes[file.node.name]
+    def local_ros_node(self, file: NodeFile, logger: LocalLogger) -> LocalRosNode:
+        node = file.node
+        return RosNodeStandIn(node.name, logger, node.parameters, _topics_of(file))
 
-    def close(self) -> None:
-        """There is nothing to release."""
+    def bridge(self, file: NodeFile) -> Topics:
+        return self._topics
+
+
+def _raise(error: BaseException) -> None:
+    raise error
 
 
 def _topics_of(file: NodeFile) -> dict[str, tuple[str, int, int]]:

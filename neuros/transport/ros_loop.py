@@ -192,6 +192,22 @@ class RosLoop:
             self._executor.spin_until_future_complete(self._waker, wait_s)
             self._run_due_timers()
 
+    def run_until_idle(self) -> None:
+        """Serve what ROS has waiting, and the events that follow from it."""
+        is_idle = False
+
+        def look() -> None:
+            nonlocal is_idle
+            if self._events or not self.has_taken_in:
+                self.post_loop_back(look)
+            else:
+                is_idle = True
+                self._waker.wake(None)
+
+        self.post_loop_back(look)
+        while not is_idle:
+            self._executor.spin_until_future_complete(self._waker, _LONG_S)
+
     def run_for(self, seconds: float) -> None:
         """Serve events for a while, for instance to let the last ones out, stopped or not."""
         end_s = time.monotonic() + seconds

@@ -32,6 +32,7 @@ from neuros.transport.lean_node import (
     Fail,
     LeanNode,
     PluginCallbacks,
+    entities,
     give_up,
     lean_node,
 )
@@ -127,12 +128,12 @@ class RosProcess:
     def mark_own_entities(self, file: NodeFile, enter: Callable[[], None], fail: Fail) -> None:
         """Remember what exists on a ROS node before its plugin gets hold of it."""
         ros_node = self.ros_node(file)
-        self._own_entities[file.node.name] = _entities(ros_node)
+        self._own_entities[file.node.name] = entities(ros_node)
         self._callbacks.append(PluginCallbacks(ros_node, self.loop, enter, fail))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         own = self._own_entities.get(file.node.name, set())
-        return not _entities(self.ros_node(file)) <= own
+        return not entities(self.ros_node(file)) <= own
 
     def join_peers(
         self,
@@ -169,13 +170,6 @@ class RosProcess:
             keep_to_the_end(self._ros_nodes.values())
         else:
             give_up(self._context, self._ros_nodes.values())
-
-
-def _entities(ros_node: RosNode) -> set[int]:
-    groups = (ros_node.subscriptions, ros_node.timers, ros_node.services, ros_node.clients)
-    return {id(entity) for group in groups for entity in group} | {
-        id(waitable) for waitable in ros_node.waitables
-    }
 
 
 # ---------------------------------------------------------------------- peers

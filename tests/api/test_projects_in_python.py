@@ -28,7 +28,7 @@ from std_msgs.msg import Int32 as Number
 import neuros
 from containers import require_containers
 from neuros.distribution import python_command
-from neuros.errors import HookError, NeurosError, ProjectError, UsageError
+from neuros.errors import HookError, NeurosError, ProjectError, RunError, UsageError
 from neuros.hooks import (
     Optional,
     neuros_finalise,
@@ -151,6 +151,38 @@ def test_functions_run_in_the_background_and_in_sessions() -> None:
             s.step()
             assert s["alice.number"].packet == Int32(data=2)
             s.reset()
+
+
+@RUNS
+def test_a_session_in_this_thread_calls_the_functions_themselves() -> None:
+    seen: list[int] = []
+
+    @neuros_function(inputs="heard", outputs=Optional("number"))
+    def add(node: neuros.NodeHandle, heard: Any) -> Int32:
+        seen.append(heard.data)
+        assert sys.modules[__name__].add_one is add_one, "modules are those of the program"
+        return Int32(data=heard.data + 1)
+
+    with talk(begin, add).session(backend="local") as s:
+        s.step(2)
+        assert seen == [0, 1, 2, 3]
+        s.reset()
+        s.step()
+        assert seen == [0, 1, 2, 3, 0, 1]
+        assert sys.modules[__name__].add_one is add_one
+
+
+@RUNS
+def test_an_error_of_a_function_in_this_thread_has_its_own_line() -> None:
+    @neuros_function(inputs="heard")
+    def fail(node: neuros.NodeHandle, heard: Any) -> None:
+        raise RuntimeError("of no use")
+
+    with (
+        talk(begin, fail).session(backend="local") as s,
+        pytest.raises(RunError, match=rf"{Path(__file__).name}:\d+: hook 'fail': RuntimeError"),
+    ):
+        s.step()
 
 
 def test_files_and_installed_modules_are_plugins_as_in_json(tmp_path: Path) -> None:

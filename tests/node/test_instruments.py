@@ -14,7 +14,7 @@ from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import CLOCK_TYPE, SimulatedTime
 from neuros.ports import Way
 from neuros.project.model import Connection, Node, Port
-from neuros.testing.stand_ins import RecordingLogger
+from neuros.runtime.local import LocalLogger
 
 NUMBER, CLOCK = Port("number", "std_msgs/msg/Int32"), Port("clock", CLOCK_TYPE)
 CONNECTION = Connection("a", "number", "b", "in", 0)
@@ -68,7 +68,10 @@ def test_the_sampler_knows_an_external_input_by_its_topic() -> None:
 def test_the_recorder_is_on_the_taps_that_are_recorded_and_encodes_once() -> None:
     kept, records = Kept(), []
     recorder = NodeRecorder(
-        kept, lambda packet: b"made", lambda: 1.5, RecordingLogger("a", records)
+        kept,
+        lambda packet: b"made",
+        lambda: 1.5,
+        LocalLogger("a", lambda _, record: records.append(record)),
     )
     taps = [Tap(Way.SENT, NUMBER), Tap(Way.SENT, CLOCK), Tap(Way.RECEIVED, NUMBER, CONNECTION)]
     for tap in taps:
@@ -81,7 +84,12 @@ def test_the_recorder_is_on_the_taps_that_are_recorded_and_encodes_once() -> Non
 
 def test_a_recorder_that_fails_says_so_once_and_the_node_goes_on() -> None:
     kept, records = Kept(), []
-    recorder = NodeRecorder(kept, lambda packet: b"", lambda: None, RecordingLogger("a", records))
+    recorder = NodeRecorder(
+        kept,
+        lambda packet: b"",
+        lambda: None,
+        LocalLogger("a", lambda _, record: records.append(record)),
+    )
     tap = Tap(Way.SENT, NUMBER)
     recorder.attach(tap)
     kept.is_full = True

@@ -38,7 +38,9 @@ REACHED = {
 # By the beginning of a test's path and name: what is reached through neuros, and what takes long.
 BY_NAME = {
     "ros": (
+        "api/test_local_sessions.py",
         "api/test_python_api.py",
+        "api/test_reset_settings.py",
         "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
         "extensions/neuros-analysis/tests/test_report.py",

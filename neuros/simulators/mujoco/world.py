@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ import numpy as np
 
 from neuros.errors import DescriptionError, ModelError, UsageError
 from neuros.ports import NodeContext, Packet
-from neuros.project.model import Node
+from neuros.project.model import MODEL_FIELDS, Node
 from neuros.registry import MODELS
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
 from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
@@ -124,6 +125,9 @@ class World(Declared):
             import_opengl()  # raises now, not at the first image
         self.steps = 0
         self._seen_warnings: set[int] = set()
+        self._fields = ModelFields(self.where)
+        self._fields.apply(self.model, self.data)
+        mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
 
     @property
@@ -168,6 +172,7 @@ class World(Declared):
 
     def reset(self) -> None:
         """Back to time zero and the model's initial state; spawned entities stay."""
+        self._fields.apply(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_forward(self.model, self.data)
         self.steps = 0
@@ -265,6 +270,62 @@ class World(Declared):
             if warning not in self._seen_warnings:
                 self._seen_warnings.add(warning)
                 self._node.get_logger().warning(f"{self.where}: MuJoCo: {text}")
+
+
+class ModelFields:
+    """Fields of the model that a reset has changed, until the next one.
+
+    They come by the environment of the node. A model that is compiled anew, since entities come or
+    go, has its own values again.
+    """
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+        self._before: dict[str, Any] = {}
+
+    def apply(self, model: Any, data: Any) -> None:
+        """Give the fields of before their values back, then change those of now.
+
+        Raises:
+            ModelError: if the model has no such field, or it has another shape.
+        """
+        fields = json.loads(os.environ.get(MODEL_FIELDS) or "{}")
+        if not (fields or self._before):
+            return
+        for name, value in self._before.items():
+            self._set(model, name, value)
+        self._before = {name: self._set(model, name, value) for name, value in fields.items()}
+        mujoco.mj_setConst(model, data)  # what MuJoCo has derived from them
+
+    def _set(self, model: Any, name: str, value: Any) -> Any:
+        """Change a field; returns its value of before."""
+        *owners, last = name.split(".")
+        owner = model
+        for each in owners:
+            owner = getattr(owner, each, None)
+        before = getattr(owner, last, None)
+        if not isinstance(before, int | float | np.ndarray):
+            known = [n for n in dir(owner) if isinstance(getattr(owner, n, None), np.ndarray)]
+            raise ModelError(
+                f"{self._where}: the model has no field '{name}' with numbers"
+                f" ({did_you_mean(last, known) or 'see the fields of mujoco.MjModel'})"
+            )
+        try:
+            array = np.asarray(value, np.float64)
+        except (TypeError, ValueError):
+            raise ModelError(f"{self._where}: {name}={value!r}: give numbers") from None
+        shape = np.shape(before)
+        if array.shape not in ((), shape):
+            raise ModelError(
+                f"{self._where}: '{name}' has the shape {shape}, not {array.shape}: give all its"
+                " values, or a number for all of them"
+            )
+        if isinstance(before, np.ndarray):
+            before = before.copy()
+            getattr(owner, last)[...] = array
+        else:
+            setattr(owner, last, type(before)(array))
+        return before
 
 
 def _frame_of(entity: str) -> str:

@@ -15,8 +15,9 @@ from typing import Any
 import rclpy
 from rclpy.signals import SignalHandlerOptions
 
-from neuros.ports import Inbox, Voice
+from neuros.ports import Inbox
 from neuros.project.model import Connection, NodeFile, Port
+from neuros.runtime.local import WithoutPeers
 from neuros.transport.lean_node import give_up, lean_node
 from neuros.transport.messages import RosPackets
 
@@ -94,34 +95,6 @@ class _NullTransport:
 
 def _nowhere(_: object) -> None:
     """Carries a packet, or an acknowledgement."""
-
-
-class WithoutPeers:
-    """The part of a middleware that a node without peers and without callbacks does not need."""
-
-    def mark_own_entities(
-        self, file: NodeFile, enter: Event, fail: Callable[[Any, BaseException], None]
-    ) -> None:
-        """Nothing of it is served."""
-
-    def has_foreign_entities(self, file: NodeFile) -> bool:
-        """Nothing can call back."""
-        return False
-
-    def join_peers(
-        self,
-        names: Sequence[str],
-        elsewhere: Sequence[str],
-        heard: Callable[[str, str | None], None],
-    ) -> Voice:
-        """There are no peers. Raises ``NotImplementedError``."""
-        raise NotImplementedError("a node without neighbours runs in one part")
-
-    def take_in(self) -> None:
-        """Nothing arrives by itself."""
-
-    def flush(self) -> None:
-        """Nothing is sent to anybody."""
 
 
 class NullMiddleware(WithoutPeers):

@@ -1,0 +1,613 @@
+"""A run whose nodes live in the thread of the program that steps it."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import ctypes
+import math
+import os
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any, ClassVar
+
+from neuros.api.live import why_it_ended
+from neuros.api.plan import Plan
+from neuros.api.run import Run
+from neuros.api.run_folder import make_run_folder, save_record, write_node_files
+from neuros.api.run_record import judge, run_record, run_table
+from neuros.backends.console import format_record
+from neuros.control import AtRest, Message, NodeStatus, Ready, Shutdown
+from neuros.errors import NeurosError, UsageError
+from neuros.launcher.outcome import EXIT_CODES, Outcome
+from neuros.launcher.quiescence import Declarations
+from neuros.node.context import ContextSwitch
+from neuros.node.failures import callback_error
+from neuros.node.node import NodeRuntime
+from neuros.node.reports import declared
+from neuros.options import recorded_values
+from neuros.project.model import Node, NodeFile
+from neuros.project.plugin_files import read_plugin
+from neuros.recording.provenance import GitState, provenance
+from neuros.runtime.local import LocalLoop, LocalMiddleware, Record, log_in_python
+from neuros.transport.digests import digest_of
+
+NAME = "local"
+"""Of this back end, in ``session(backend=...)`` and in ``run.json``."""
+
+_DRAIN_S = 5.0
+_REPORT_S = 1.0
+_CELL_S = 0.02
+_CHECKS = 100
+_GRACE_S = 1.0
+"""How much longer than its time-out a step may take until the hook that runs is interrupted."""
+
+
+class LocalRun:
+    """Holds a run for a session, in the thread that calls (:class:`HeldRun`).
+
+    Nodes have the environment, the import path, the modules and the current folder that they have
+    in a process of their own, while their code runs. A hook that crashes the process, or that never
+    returns, is the program's.
+
+    Args:
+        plan: the project with the inputs of the session, and how to run it.
+        messages: folders of its message packages, for ``sys.path``.
+        exposes: whether ROS tools see its topics.
+
+    Raises:
+        UsageError: if the run folder cannot be made.
+    """
+
+    _nest_user: ClassVar[LocalRun | None] = None
+
+    def __init__(self, plan: Plan, messages: Sequence[Path], *, exposes: bool) -> None:
+        request, project = plan.request, plan.project
+        sys.path[:0] = [path for path in map(str, messages) if path not in sys.path]
+        self._plan = plan
+        self._started = time.time()
+        self._started_s = time.monotonic()
+        self._run_id = os.urandom(8).hex()
+        self._git = GitState(project.folder)
+        self.folder = make_run_folder(request.output, project.name)
+        _, self._files = write_node_files(plan, self.folder, keeps_functions=True)
+        self._outcome = Outcome()
+        self._declarations = Declarations(self._files)
+        self._ready: set[str] = set()
+        self.error: NeurosError | None = None
+        self._end: tuple[str, float, str] | None = None  # reason, seconds to drain, node
+        self._run: Run | None = None
+        self._has_begun = self._is_active = False
+        self._next_report_s = self._started_s + _REPORT_S
+        self._is_behind = False
+        self._sent: list[Callable[[], None]] = []
+        self._is_shown = bool(getattr(request, "show", False))
+        self._loop = LocalLoop()
+        digest = digest_of if request.digests else None
+        self._middleware = LocalMiddleware(
+            self._loop, self._write, self._fail_in_callback, exposes=exposes, digest=digest
+        )
+        self._contexts = ContextSwitch()
+        self._contexts.hide_from_nodes(project.folder)
+        self._nodes: dict[str, NodeRuntime] = {}
+        self._thread = _Thread(
+            self.folder,
+            self._loop,
+            self._contexts.leave,
+            self._describe_hang,
+            self._fail_after_hang,
+        )
+        atexit.register(self._end_with_program)
+        try:
+            with self._inside():
+                self._load()
+                self._loop.run_until_idle()
+        except BaseException as error:
+            self.interrupt(*why_it_ended(error))
+            raise
+        if self._failed_or_over():
+            self._finish()
+
+    # ------------------------------------------------------------------ steps
+
+    @property
+    def is_behind(self) -> bool:
+        """Whether a step was given up, and nothing has come to rest since."""
+        return self._is_behind
+
+    def begin(self, known: Mapping[str, int]) -> AtRest | None:
+        """The initialise hooks have run."""
+        return self._rest(known)
+
+    def advance(
+        self,
+        rounds: int,
+        known: Mapping[str, int],
+        end_s: float | None = None,
+        end_sim_s: float | None = None,
+    ) -> AtRest | None:
+        """Go on by rounds; see :meth:`HeldRun.advance`."""
+        if self._run is not None:
+            return None
+        nodes = self._nodes.values()
+        with self._inside(end_s):
+            self._deliver_sent()
+            if self._is_behind or not rounds:
+                self._come_to_rest()
+            for _ in range(rounds):
+                if end_sim_s is not None and (self._sim_time() or 0.0) >= end_sim_s:
+                    break
+                is_driven = any(
+                    node.engine is not None and node.engine.is_driving for node in nodes
+                )
+                self._is_behind = True
+                for node in nodes:
+                    node.step(1, is_driven=is_driven)
+                self._come_to_rest()
+                if self._failed_or_over():
+                    break
+        return self._rest(known)
+
+    def run_for(self, duration_s: float, known: Mapping[str, int]) -> AtRest | None:
+        """Let the run go freely; see :meth:`HeldRun.run_for`."""
+        if self._run is not None:
+            return None
+        began_s = time.monotonic()
+        with self._inside():
+            self._deliver_sent()
+            for node in self._nodes.values():
+                node.resume()
+            try:
+                self._loop.run_for(duration_s)
+            finally:
+                for node in self._nodes.values():
+                    node.pause()
+                self._outcome.paused_s -= time.monotonic() - began_s
+            self._come_to_rest()
+        return self._rest(known)
+
+    def deliver(self, node: str, input_name: str, packet: Any) -> None:
+        """Put a packet into the queue of an input, where the next round finds it."""
+        port = self._nodes[node].file.node.input(input_name)
+        own = self.copy(port.type, packet)
+        self._sent.append(partial(self._nodes[node].on_external_packet, port, own))
+
+    def copy(self, type_name: str, content: Any) -> Any:
+        """A packet of its own for the program."""
+        return self._middleware.packets.copier(type_name)(content)
+
+    def look(self) -> Sequence[NodeStatus] | None:
+        """State and counters of each node."""
+        if self._run is not None or (not self._is_behind and self.advance(0, {}) is None):
+            return None
+        return [node.reports.look({}, 0) for node in self._nodes.values()]
+
+    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+        """Bring all nodes back to their start, if they can be; see :meth:`HeldRun.reset`."""
+        nodes = self._nodes.values()
+        if self._run is not None or any(node.why_not_reset for node in nodes):
+            return False
+        with self._inside():
+            self._sent.clear()
+            for node in nodes:
+                node.pause()  # takes back what is left of steps, which might go on for ever
+            self._loop.run_until_idle()
+            for node in nodes:
+                try:
+                    node.reset(variables.get(node.name, {}))
+                except NeurosError as error:
+                    self._fail(node.name, error)
+                    break
+                self._declarations.take(declared(node.name, node.specs))
+                self._loop.post(partial(node.start, awaits_others=not self._is_active))
+            self._come_to_rest()
+        return True
+
+    # ------------------------------------------------------------------ ends
+
+    def stop(self, reason: str) -> None:
+        """End the run, drained."""
+        self._end = self._end or (reason, _DRAIN_S, "")
+        self._finish()
+
+    def interrupt(self, reason: str, exit_code: int) -> None:
+        """End the run at once, with an exit code."""
+        if self._run is None:
+            self._outcome.fail(reason, exit_code)
+            self._finish()
+
+    def wait(self) -> Run:
+        """What the run, which has ended, has left behind."""
+        assert self._run is not None
+        return self._run
+
+    def last_packets(self, output: str) -> tuple[int, Sequence[Any]]:
+        """The packets of an output that were kept until the end."""
+        node, _, port = output.partition(".")
+        history = self._nodes[node].histories.by_output.get(port) if node in self._nodes else None
+        return (history.count, [*history.packets]) if history is not None else (0, ())
+
+    # ------------------------------------------------------------------ inside
+
+    def _load(self) -> None:
+        self._claim_nest()
+        for file in self._files:
+            try:
+                self._add(file)
+            except NeurosError as error:
+                self._fail(file.node.name, error)
+                return
+        self._has_begun = True
+        for node in self._nodes.values():
+            node.reports.begin()
+        for node in self._nodes.values():
+            node.start(awaits_others=True)
+
+    def _claim_nest(self) -> None:
+        """Have NEST begin anew, if nodes of this run use it: its kernel is that of the process.
+
+        Raises:
+            UsageError: if another session of the program uses it now.
+        """
+        if not any(_uses_nest(file.node) for file in self._files):
+            return
+        user = LocalRun._nest_user
+        if user is not None:
+            raise UsageError(
+                f"NEST has one kernel per process, and the session in {user.folder} uses it: close"
+                ' that, or use session(backend="process")'
+            )
+        LocalRun._nest_user = self
+        if "nest" in sys.modules:
+            sys.modules["nest"].ResetKernel()
+
+    def _add(self, file: NodeFile) -> None:
+        node = self._nodes[file.node.name] = NodeRuntime(
+            file,
+            self._middleware,
+            self._contexts,
+            tell=self._receive,
+            fail=self._fail,
+            log_file=None,
+            duration_sim_s=self._plan.request.end.sim_s,
+            is_held=True,
+            is_local=True,
+        )
+        node.load()
+        self._declarations.take(declared(node.name, node.specs))
+
+    def _activate(self) -> None:
+        """Every node is ready: this is time 0 of the run."""
+        self._is_active = True
+        self._outcome.started_s = time.monotonic()
+        for node in self._nodes.values():
+            node.activate()
+        for node in self._nodes.values():
+            node.on_timer()
+
+    def _come_to_rest(self) -> None:
+        """Handle events until none waits, then take back what hooks could not use of a round."""
+        self._loop.run_until_idle()
+        self._is_behind = False
+        for node in self._nodes.values():
+            node.pause()
+
+    def _deliver_sent(self) -> None:
+        """Put what the program has sent into the queues, before a round begins."""
+        sent, self._sent = self._sent, []
+        for deliver in sent:
+            deliver()
+
+    def _sim_time(self) -> float | None:
+        times = (node.sim_time for node in self._nodes.values())
+        return max((time_s for time_s in times if time_s is not None), default=None)
+
+    def _rest(self, known: Mapping[str, int]) -> AtRest | None:
+        if self._failed_or_over():
+            self._finish()
+            return None
+        if (now_s := time.monotonic()) >= self._next_report_s:
+            self._next_report_s = now_s + _REPORT_S
+            for node in self._nodes.values():
+                node.reports.write_logs()
+                self._outcome.take(node.reports.report(), now_s)
+        packets = {}
+        for name, number in known.items():
+            node_name, _, output = name.partition(".")
+            history = self._nodes[node_name].histories.by_output.get(output)
+            if history is not None and history.count > number:
+                packets[name] = history.count, history.since(number)
+        times = {n.name: time_s for n in self._nodes.values() if (time_s := n.sim_time) is not None}
+        return AtRest(0, times, packets)
+
+    def _inside(self, end_s: float | None = None) -> _Thread:
+        """The thread of the program for nodes, until a time (monotonic, seconds)."""
+        return self._thread.until(end_s)
+
+    def _describe_hang(self, thread: int) -> str:
+        """Where a hook stands that does not return."""
+        frame = sys._current_frames().get(thread)
+        for node in self._nodes.values():
+            hook = node.engine.executing if node.engine is not None else None
+            if hook is not None and frame is not None:
+                stack = traceback.extract_stack(frame)
+                files = [each.filename for each in stack]
+                plugin = str(node.file.node.plugin)
+                own = stack[files.index(plugin) :] if plugin in files else stack
+                lines = "".join(traceback.format_list(own))
+                text = f"hook '{hook.name}' did not return in time; it stood here:\n{lines}"
+                self._write(node.name, Record("ERROR", text))
+                return f"node '{node.name}': {text}"
+        return "the step did not end in time"
+
+    def _fail_after_hang(self) -> None:
+        """A hook was interrupted, or the engine, whose state is unknown then."""
+        if not self._outcome.failures:
+            self._outcome.fail("a step that took too long was interrupted")
+        self._finish()
+
+    # ------------------------------------------------------------------ what nodes say
+
+    def _receive(self, message: Message) -> None:
+        if isinstance(message, Ready):
+            self._ready.add(message.node)
+            if not self._is_active and len(self._ready) == len(self._files):
+                self._loop.post(self._activate)
+        elif isinstance(message, Shutdown) and self._end is None:
+            because = f": {message.reason}" if message.reason else ""
+            reason = f"{message.node} ended the project{because}"
+            self._end = reason, message.drain_s, message.node
+
+    def _fail(self, name: str, error: NeurosError) -> None:
+        if name in self._nodes:
+            self._nodes[name].failures.log(error)
+        else:
+            self._write(name, Record("ERROR", str(error)))
+        self.error = self.error or error
+        first_line = (str(error).strip() or "no reason was given").splitlines()[0]
+        self._outcome.fail(f"node '{name}' failed: {first_line}")
+        for node in self._nodes.values():
+            node.stop()
+
+    def _fail_in_callback(self, error: BaseException) -> None:
+        name = self._files[0].node.name
+        self._fail(name, error if isinstance(error, NeurosError) else callback_error(error))
+
+    def _failed_or_over(self) -> bool:
+        return self._end is not None or bool(self._outcome.failures)
+
+    def _write(self, name: str, record: Record) -> None:
+        """Write a record into the log of its node, and pass it on to Python's ``logging``."""
+        node = name.partition(".")[0]
+        line = format_record(record.severity, name, record.text) + "\n"
+        with contextlib.suppress(OSError), open(self.folder / node / "node.log", "a") as log:
+            log.write(line)
+        if self._is_shown:
+            sys.stdout.write(line)
+        log_in_python(name, record)
+
+    # ------------------------------------------------------------------ the end
+
+    def _finish(self) -> None:
+        """Drain, if the run ends well; finalise all nodes; write ``run.json``."""
+        if self._run is not None:
+            return
+        outcome = self._outcome
+        outcome.begin_to_end(time.monotonic())
+        try:
+            if self._end is not None and not outcome.failures and self._is_active:
+                outcome.reason, drain_s, stopped = self._end
+                self._drain(drain_s, stopped)
+            with self._inside():
+                for node in self._nodes.values():
+                    node.finalise(runs_hooks=self._has_begun)
+                    node.reports.write_logs()
+                    outcome.take(node.reports.report(is_final=True), time.monotonic())
+        finally:
+            self._middleware.close()
+            self._contexts.close()
+            self._thread.close()
+            atexit.unregister(self._end_with_program)
+            if LocalRun._nest_user is self:
+                LocalRun._nest_user = None
+            self._record()
+            self._run = Run(self.folder)
+
+    def _drain(self, drain_s: float, stopped: str) -> None:
+        last_round = self._declarations.last_round(stopped)
+        try:
+            with self._inside(time.monotonic() + drain_s):
+                for node in self._nodes.values():
+                    node.drain(last_round.get(node.name, ()))
+                self._loop.run_until_idle()
+        except TimeoutError as error:
+            self._outcome.late_drain = str(error)
+        self._outcome.has_drained = True
+
+    def _record(self) -> None:
+        plan, outcome = self._plan, self._outcome
+        outcome.ended_s = time.monotonic()
+        if outcome.started_s is not None:
+            outcome.paused_s += outcome.ended_s - outcome.started_s
+        wall_s = outcome.ended_s - (outcome.started_s or self._started_s)
+        record = run_record(plan.project, self._files, outcome, wall_s, self.folder)
+        record |= {
+            "backend": NAME,
+            "is_one_process": True,
+            "domain_id": None,
+            "namespace": plan.project.names.namespace,
+            "started": self._started,
+            "options": recorded_values(plan.request),
+            "run_id": self._run_id,
+            **provenance(sys.argv, plan.project.nodes, self.folder),
+            "git": self._git.finish(),
+        }
+        judge(record, outcome, plan.project.budgets)
+        save_record(record, outcome, self.folder, self._run_id)
+        if self._is_shown:
+            sys.stdout.write(f"\n{run_table(record)}\n\n{outcome.reason}\n")
+
+    def _end_with_program(self) -> None:
+        self.interrupt("the program ended before it closed the session", EXIT_CODES[signal.SIGINT])
+
+
+class StepTimeout(BaseException):
+    """Interrupts a hook that has run for longer than its step may take."""
+
+    def __str__(self) -> str:
+        return "it did not return within the time-out of the step"
+
+
+class _Thread:
+    """The thread of the program while nodes run in it.
+
+    Their folder is the current one then. Ctrl+C waits for the hook that runs; a second one does
+    not.
+
+    Args:
+        folder: the run folder.
+        leave: gives the process its own environment and modules back.
+        describe_hang: where the thread of this number stands.
+        on_hang: called outside, after a hook that did not return has been interrupted.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        loop: LocalLoop,
+        leave: Callable[[], None],
+        describe_hang: Callable[[int], str],
+        on_hang: Callable[[], None],
+    ) -> None:
+        self._folder = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        self._program_path, self._program_folder = "", -1
+        self._loop = loop
+        self._leave = leave
+        self._describe_hang = describe_hang
+        self._on_hang = on_hang
+        self._watchdog: _Watchdog | None = None
+        self._is_inside = False
+        self._left_s = -math.inf
+
+    def until(self, end_s: float | None) -> _Thread:
+        """Interrupt at a time (monotonic, seconds)."""
+        if end_s is not None:
+            self._watchdog = _Watchdog(end_s, self._loop, self._describe_hang)
+        return self
+
+    def __enter__(self) -> None:
+        path = os.getcwd()
+        if path != self._program_path:
+            if self._program_folder >= 0:
+                os.close(self._program_folder)
+            self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
+            self._program_path = path
+        os.fchdir(self._folder)
+        # A notebook exchanges the handler with each cell, so it is looked at after a pause.
+        if time.monotonic() - self._left_s > _CELL_S:
+            self._handle_interrupts()
+        self._is_inside = True
+        if self._watchdog is not None:
+            self._watchdog.begin()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
+    ) -> None:
+        watchdog, self._watchdog = self._watchdog, None
+        hang = ""
+        try:
+            if watchdog is not None:
+                watchdog.end()
+                hang = watchdog.hang
+        except StepTimeout:
+            hang = watchdog.hang if watchdog is not None else ""
+        self._is_inside = False
+        self._leave()
+        os.fchdir(self._program_folder)
+        self._left_s = time.monotonic()
+        interruption, self._loop.interruption = self._loop.interruption, None
+        if hang:
+            self._on_hang()
+            raise TimeoutError(hang)
+        if error is None and isinstance(interruption, KeyboardInterrupt):
+            raise interruption
+
+    def close(self) -> None:
+        """Leave folders and signals as they were."""
+        os.close(self._folder)
+        if self._program_folder >= 0:
+            os.close(self._program_folder)
+        if _is_main() and signal.getsignal(signal.SIGINT) == self._on_interrupt:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def _handle_interrupts(self) -> None:
+        if _is_main() and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, self._on_interrupt)
+
+    def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
+        if not self._is_inside or self._loop.interruption is not None:
+            signal.default_int_handler(number, frame)
+        self._loop.interruption = KeyboardInterrupt()
+
+
+def _uses_nest(node: Node) -> bool:
+    if node.container.partition(":")[0] == "neuros_nest":
+        return True
+    plugin = read_plugin(node.plugin)
+    return plugin is not None and any(n.name.partition(".")[0] == "nest" for n in plugin.needs)
+
+
+def _is_main() -> bool:
+    return threading.current_thread() is threading.main_thread()
+
+
+class _Watchdog:
+    """Ends a step at its time: between two events, or, a moment later, in the midst of a hook.
+
+    Args:
+        end_s: monotonic, seconds.
+        describe: where the thread of this number stands.
+
+    Attributes:
+        hang: where the hook stood that did not return; empty if there was none.
+    """
+
+    def __init__(self, end_s: float, loop: LocalLoop, describe: Callable[[int], str]) -> None:
+        self._end_s = end_s
+        self._loop = loop
+        self._describe = describe
+        self._thread_id = threading.get_ident()
+        self._is_over = threading.Event()
+        self._lock = threading.Lock()
+        self.hang = ""
+
+    def begin(self) -> None:
+        """Watch from now on."""
+        threading.Thread(target=self._watch, name="neuros-watchdog", daemon=True).start()
+
+    def end(self) -> None:
+        """Watch no more. Raises what it has set for this thread and has not come yet."""
+        with self._lock:
+            self._is_over.set()
+        for _ in range(_CHECKS if self.hang else 0):
+            """Python raises what another thread has set at the next turn of a loop."""
+
+    def _watch(self) -> None:
+        if self._is_over.wait(max(0.0, self._end_s - time.monotonic())):
+            return
+        self._loop.interruption = TimeoutError("the run has not come to rest in time")
+        if self._is_over.wait(_GRACE_S):
+            return
+        with self._lock:
+            if not self._is_over.is_set():
+                self.hang = self._describe(self._thread_id)
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(
+                    ctypes.c_ulong(self._thread_id), ctypes.py_object(StepTimeout)
+                )

@@ -1,0 +1,1 @@
+"""Nodes in the thread that calls them."""
