@@ -176,7 +176,7 @@ def _unknown_in_containers(project: Project, workspaces: Workspaces) -> Iterator
         for side, ports in (("inputs", node.inputs), ("outputs", node.outputs)):
             for index, port in enumerate(ports):
                 unknown = unknown_type(port.type, must_be_here=True, packages=workspaces)
-                package = port.type.partition("/")[0]
+                package = port.ros_type.partition("/")[0]
                 if unknown and not _names_package(container.folder, package):
                     yield problem_in(node.file, f"{node.pointer}/{side}/{index}/type", *unknown)
         package = node.module.partition(".")[0]

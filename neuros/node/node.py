@@ -364,7 +364,7 @@ class NodeRuntime:
     def _load_plugin(self) -> None:
         node = self.file.node
         for port in (*node.inputs, *node.outputs):  # the plugin may make messages when imported
-            self._middleware.packets.message_class(port.type)
+            self._middleware.packets.packet_class(port.type)
         specs: Sequence[HookSpec] = hook_specs_of(dict(enumerate(node.hooks)))
         if not node.hooks:
             specs = load_plugin(node.plugin, self.name, node.module)
@@ -403,10 +403,10 @@ class NodeRuntime:
 
     def _packet_type(self, port: Port) -> PacketType:
         packets = self._middleware.packets
-        kind = packets.message_class(port.type)
         own = [c for c in self.file.connections if c.source_node == self.file.node.name]
         for_jpeg = any(c.is_jpeg for c in own if c.source_output == port.name)
-        return PacketType(kind, packets.checker(kind, for_jpeg=for_jpeg))
+        check = packets.checker(port.type, for_jpeg=for_jpeg)
+        return PacketType(packets.packet_class(port.type), check)
 
     @property
     def _loaded(self) -> Engine:

@@ -95,6 +95,25 @@ class _Request:
         return found
 
 
+class _ArrayMessage:
+    """An array as the message that it is in ROS, without its layout.
+
+    Attributes:
+        data: its numbers, row by row.
+    """
+
+    def __init__(self, packet: Any) -> None:
+        self.data = packet.reshape(-1)
+
+    @staticmethod
+    def get_fields_and_field_types() -> Sequence[str]:
+        return ("data",)
+
+
+def _as_it_is(packet: Any) -> Any:
+    return packet
+
+
 class Sampler:
     """Looks at packets for observers.
 
@@ -114,8 +133,8 @@ class Sampler:
         """Look at the packets there while they are asked for."""
         if tap.way is not Way.RECEIVED:
             port = tap.port.external_topic if tap.way is Way.HEARD else tap.port.name
-            name = str(port)
-            self._taps.append((name, tap, lambda packet, _: self.note(name, packet)))
+            name, seen = str(port), _ArrayMessage if tap.port.array else _as_it_is
+            self._taps.append((name, tap, lambda packet, _: self.note(name, seen(packet))))
 
     def note(self, port: str, packet: Any) -> None:
         """A packet passes. The thread of the hooks only."""

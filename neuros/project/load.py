@@ -19,7 +19,13 @@ from neuros.project.checks import (
 )
 from neuros.project.dashboard import dashboard_of
 from neuros.project.in_python import FILE, PythonProject
-from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
+from neuros.project.message_types import (
+    NO_PACKAGES,
+    MessagePackages,
+    normalised,
+    unknown_type,
+    wrong_array,
+)
 from neuros.project.model import (
     FINALISE_S,
     NETWORK,
@@ -174,8 +180,9 @@ class _Builder:
     def _port(self, element: Element, *, is_input: bool, must_be_here: bool) -> Port:
         written, keys = element.string("type") or "", element.plain
         type_name = normalised(written)
-        unknown = type_name and unknown_type(
-            type_name, must_be_here=must_be_here, packages=self._roots.packages
+        unknown = wrong_array(written) or (
+            type_name
+            and unknown_type(type_name, must_be_here=must_be_here, packages=self._roots.packages)
         )
         if unknown:
             self.problems.append(element.value["type"].problem(*unknown))

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
+from neuros.project.message_types import ArrayType, array_type, ros_type
 from neuros.project.names import INTERNAL, Names
 from neuros.project.qos import Qos
 
@@ -69,7 +70,7 @@ class Port:
 
     Attributes:
         name: unique among the inputs, or among the outputs, of its node.
-        type: message type in ROS notation, ``"std_msgs/msg/String"``.
+        type: message type in ROS notation, ``"std_msgs/msg/String"``, or ``"float64[18]"``.
         external_topic: the plain ROS topic that it is bound to, as written, or ``None``;
             :meth:`Names.resolve` tells its full name.
         qos: of the external topic, or ``None`` if the file has none.
@@ -83,6 +84,16 @@ class Port:
     mujoco: Mapping[str, Any] = field(default_factory=lambda: _NOTHING, hash=False)
     gazebo_type: str | None = None
     qos: Qos | None = None
+
+    @property
+    def array(self) -> ArrayType | None:
+        """The type of its packets if they are NumPy arrays, ``None`` if they are messages."""
+        return array_type(self.type)
+
+    @property
+    def ros_type(self) -> str:
+        """The type of its packets on the ROS graph and in bags."""
+        return ros_type(self.type)
 
 
 @dataclass(frozen=True)

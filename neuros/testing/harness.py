@@ -46,7 +46,7 @@ from neuros.testing.stand_ins import (
     with_observer,
 )
 from neuros.transport.memory import MemoryHub
-from neuros.transport.messages import checked, copy_packet, message_class
+from neuros.transport.messages import checked, copy_packet, make_packet
 
 _MANY = 10_000
 """Hook executions after which :meth:`PluginHarness.run` assumes that they never end."""
@@ -436,8 +436,8 @@ class PluginHarness:
     # ------------------------------------------------------------------ what goes in
 
     def make_packet(self, port: str) -> Any:
-        """A new message of the type of an input (or else an output), with default values."""
-        return message_class(self._port(port, "port", self._inputs | self._outputs).type)()
+        """A new packet for an input (or else an output): default values, an array of zeros."""
+        return make_packet(self._port(port, "port", self._inputs | self._outputs).type)
 
     def send(self, input_name: str, *packets: Any, source: str | None = None) -> None:
         """Send packets to an input; packets that its connection does not let through yet wait.
