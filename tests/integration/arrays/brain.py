@@ -1,6 +1,5 @@
 """A brain: it pushes the state back to zero, and tells which rows of the picture are lit."""
 
-
 from neuros.hooks import neuros_function
 
 
