@@ -9,7 +9,7 @@ from typing import Any
 
 from neuros.errors import NodeError
 from neuros.ports import Inbox
-from neuros.project.message_types import in_full, normalised
+from neuros.project.message_types import in_full, normalised, wrong_array
 from neuros.project.model import Connection, Node, NodeFile, Port, Value
 from neuros.runtime.local import (
     LocalLogger,
