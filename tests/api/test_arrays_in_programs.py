@@ -40,8 +40,8 @@ PORTS: dict[str, Any] = {
 }
 
 
-@pytest.fixture
-def session(tmp_path: Path) -> Iterator[Session]:
+@pytest.fixture(params=["local", "in-process", "process"])
+def session(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Session]:
     (tmp_path / "cart.py").write_text(CART)
     ports = {
         side: [{"name": name, "type": kind} for name, kind in types.items()]
@@ -51,7 +51,7 @@ def session(tmp_path: Path) -> Iterator[Session]:
     (tmp_path / "project.json").write_text(json.dumps({"nodes": [node]}))
     with pytest.warns(UserWarning, match="is not connected"):
         project = neuros.Project.from_file(tmp_path)
-    with project.session(backend="in-process", output=tmp_path / "run") as session:
+    with project.session(backend=request.param, output=tmp_path / "run") as session:
         yield session
 
 
