@@ -13,7 +13,7 @@ import pytest
 
 import neuros
 from neuros.api.session import Session
-from neuros.errors import HookError
+from neuros.errors import HookError, UsageError
 from neuros.testing import PluginHarness, wire
 
 CART = """
@@ -57,13 +57,17 @@ def session(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Session]
 
 def test_a_session_sends_and_reads_arrays(session: Session) -> None:
     force = np.array([1.0])
-    states = []
+    states, probe = [], session.probe("cart.state")
     for _ in range(3):
         session.send("cart.force", force)
         force += 1.0  # it was sent as it was
         session.step()
         states.append(session["cart.state"].packet)
     assert np.array_equal(states, [[0.5, 0.5], [2.0, 1.5], [5.0, 3.0]])
+    assert np.array_equal(probe.array(), states)
+    assert np.array_equal(session["cart.state"].packets, states)
+    with pytest.raises(UsageError, match=r"cart.state: float64\[2\] has no field 'data'"):
+        probe.array("data")
     assert session["cart.far"].packet.tolist() == [True, True]
     assert (session["cart.state"].count, session["cart.far"].count) == (3, 2)
     with pytest.raises(ValueError, match="read-only"):
