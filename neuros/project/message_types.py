@@ -16,7 +16,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from neuros.project.suggest import did_you_mean, listed
 
@@ -101,8 +101,7 @@ _OTHER_DTYPES = {
 """Other names of numbers, and those that no ROS message holds, with the type to write instead."""
 
 
-@dataclass(frozen=True)
-class ArrayType:
+class ArrayType(NamedTuple):
     """The type of a port whose packets are NumPy arrays, ``float64[18]``.
 
     Attributes:

@@ -123,7 +123,13 @@ Copy: TypeAlias = Callable[[Any], Any]
 
 def make_packet(type_name: str) -> Any:
     """A new packet of a type: a message as its class without arguments makes it, or zeros."""
-    return _factory(packet_kind(type_name))()
+    return _factory_of_type(type_name)()
+
+
+@cache
+def _factory_of_type(type_name: str) -> Callable[[], Any]:
+    factory: Callable[[], Any] = _factory(packet_kind(type_name))
+    return factory
 
 
 def encode_packet(packet: Any) -> bytes:
@@ -150,7 +156,7 @@ class RosPackets:
         return checker(packet_kind(type_name))
 
     def copier(self, type_name: str) -> Copy:
-        return _copier(packet_kind(type_name))
+        return _copier_of_type(type_name)
 
     def decode(self, type_name: str, data: bytes) -> Any:
         return message_codec(packet_kind(type_name)).decode(data)
@@ -190,6 +196,12 @@ def _factory_of(field: Field) -> Callable[[Any], Callable[[], Any]]:
         return lambda _: _factory(field.type.message)
     copy = _copier_of(field)
     return lambda value: partial(copy, value)
+
+
+@cache
+def _copier_of_type(type_name: str) -> Copy:
+    copier: Copy = _copier(packet_kind(type_name))
+    return copier
 
 
 def _copy_array(packet: Any) -> Any:

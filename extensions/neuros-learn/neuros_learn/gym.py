@@ -479,6 +479,8 @@ class _ArrayNumbers(_Numbers):
         if given.size != self._array.size:
             raise UsageError(f"{self.name} takes {self._array.size} numbers, not {given.size}")
         given = given.reshape(self._array.shape)
+        if given.dtype == self._array.dtype:
+            return given
         if given.dtype.kind == "f" and not is_float:
             given = np.rint(given)
         with np.errstate(over="ignore", invalid="ignore"):

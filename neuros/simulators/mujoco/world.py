@@ -121,6 +121,7 @@ class World(Declared):
         problems = Problems(node.description.file)
         super().__init__(node.description, lambda: _load_spec(node, model), problems, fine=fine)
         self.data = mujoco.MjData(self.model)
+        self._warnings = self.data.warning.number
         if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
             import_opengl()  # raises now, not at the first image
         self.steps = 0
@@ -154,7 +155,7 @@ class World(Declared):
         """Advance the physics; raises ``ModelError`` if it has become unstable."""
         mujoco.mj_step(self.model, self.data, nstep=count)
         self.steps += count
-        if self.data.warning.number.any():
+        if self._warnings.any():
             self._report_warnings(count)
 
     def sense(self, outputs: Iterable[str]) -> dict[str, Packet]:
@@ -240,6 +241,7 @@ class World(Declared):
         """
         old, before = self.model, self.data
         self.model, self.data = self._spec.recompile(old, before)
+        self._warnings = self.data.warning.number
         self.cameras.use(self.model)
         self._bound = self._bind(self.model, Problems(self._node.description.file))
         mujoco.mj_forward(self.model, self.data)
