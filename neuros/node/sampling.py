@@ -110,10 +110,6 @@ class _ArrayMessage:
         return ("data",)
 
 
-def _as_it_is(packet: Any) -> Any:
-    return packet
-
-
 class Sampler:
     """Looks at packets for observers.
 
@@ -133,8 +129,12 @@ class Sampler:
         """Look at the packets there while they are asked for."""
         if tap.way is not Way.RECEIVED:
             port = tap.port.external_topic if tap.way is Way.HEARD else tap.port.name
-            name, seen = str(port), _ArrayMessage if tap.port.array else _as_it_is
-            self._taps.append((name, tap, lambda packet, _: self.note(name, seen(packet))))
+            name, is_array = str(port), tap.port.array is not None
+
+            def observe(packet: Any, _: bytes | None) -> None:
+                self.note(name, _ArrayMessage(packet) if is_array else packet)
+
+            self._taps.append((name, tap, observe))
 
     def note(self, port: str, packet: Any) -> None:
         """A packet passes. The thread of the hooks only."""

@@ -123,13 +123,21 @@ Copy: TypeAlias = Callable[[Any], Any]
 
 def make_packet(type_name: str) -> Any:
     """A new packet of a type: a message as its class without arguments makes it, or zeros."""
-    return _factory_of_type(type_name)()
+    return factory_of(type_name)()
 
 
 @cache
-def _factory_of_type(type_name: str) -> Callable[[], Any]:
+def factory_of(type_name: str) -> Callable[[], Any]:
+    """The function that makes packets of a type."""
     factory: Callable[[], Any] = _factory(packet_kind(type_name))
     return factory
+
+
+@cache
+def copier_of(type_name: str) -> Copy:
+    """The function that copies packets of a type."""
+    copier: Copy = _copier(packet_kind(type_name))
+    return copier
 
 
 def encode_packet(packet: Any) -> bytes:
@@ -142,6 +150,7 @@ class RosPackets:
 
     make = staticmethod(make_packet)
     encode = staticmethod(encode_packet)
+    copier = staticmethod(copier_of)
 
     @staticmethod
     def packet_class(type_name: str) -> type:
@@ -154,9 +163,6 @@ class RosPackets:
 
             return jpeg_checker()
         return checker(packet_kind(type_name))
-
-    def copier(self, type_name: str) -> Copy:
-        return _copier_of_type(type_name)
 
     def decode(self, type_name: str, data: bytes) -> Any:
         return message_codec(packet_kind(type_name)).decode(data)
@@ -196,12 +202,6 @@ def _factory_of(field: Field) -> Callable[[Any], Callable[[], Any]]:
         return lambda _: _factory(field.type.message)
     copy = _copier_of(field)
     return lambda value: partial(copy, value)
-
-
-@cache
-def _copier_of_type(type_name: str) -> Copy:
-    copier: Copy = _copier(packet_kind(type_name))
-    return copier
 
 
 def _copy_array(packet: Any) -> Any:
