@@ -16,7 +16,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Float64MultiArray, MultiArrayDimension, UInt8MultiArray
 
 from neuros.errors import WrongValue
-from neuros.project.message_types import ArrayType, array_type, normalised
+from neuros.project.message_types import ArrayType, array_type, normalised, wrong_array
 from neuros.project.model import Port
 from neuros.transport.codecs import WrongBytes, message_codec
 from neuros.transport.digests import digest_for, digest_of
@@ -250,6 +250,24 @@ def test_the_digest_does_not_depend_on_the_way(shape: tuple[int, ...], tmp_path:
 def test_a_type_has_one_name_and_one_message(written: str, name: str, message: str) -> None:
     assert normalised(written) == name
     assert Port("x", name).ros_type == message
+
+
+@given(st.sampled_from(DTYPES), st.lists(st.integers(1, 9), min_size=1, max_size=5))
+def test_every_type_and_shape_is_understood_as_it_is_written(dtype: str, shape: list[int]) -> None:
+    name = str(ArrayType(dtype, tuple(shape)))
+    assert normalised(name) == name
+    assert array_type(name) == ArrayType(dtype, tuple(shape))
+    assert wrong_array(name) is None
+    assert make_packet(name).nbytes == array_type(name).nbytes
+
+
+@given(st.text(st.characters(codec="ascii"), max_size=12), st.text("0123456789, []-", max_size=12))
+def test_any_other_text_is_a_message_or_wrong(dtype: str, shape: str) -> None:
+    written = f"{dtype}[{shape}]"
+    if array_type(written) is None:
+        assert normalised(written) is None
+    else:
+        assert wrong_array(written) is None
 
 
 def test_a_program_sends_arrays_of_the_type_only() -> None:

@@ -553,46 +553,17 @@ def _upright_s(example: Path, folder: Path, seeds: Sequence[int]) -> list[float]
 # ---------------------------------------------------------------------- ports of arrays
 
 UNCONNECTED = pytest.mark.filterwarnings("ignore:.*is not connected")
-CHEETAH = """
-import numpy as np
-from neuros.hooks import Optional, neuros_function, neuros_initialise, neuros_reset
-from neuros.simulators.mujoco import MuJoCo
-
-@neuros_initialise(outputs="observation")
-def start(node):
-    node.set_user_data(MuJoCo(node, "half_cheetah.xml"))
-    return begin(node)
-
-@neuros_reset(outputs="observation")
-def begin(node):
-    sim = node.get_user_data()
-    sim.reset()
-    return np.concatenate([sim.data.qpos[1:], sim.data.qvel])
-
-@neuros_function(inputs=Optional("action"), outputs="observation")
-def move(node, action):
-    sim = node.get_user_data()
-    if action is not None:
-        sim.command("action", action)
-    sim.step_to_next()
-    return sim.read("observation")
-"""
+SIMULATORS = ROOT / "docs" / "simulators.md"
 
 
 def cheetah(folder: Path) -> Path:
-    """A half-cheetah whose action and observation are arrays, those of Gymnasium's."""
+    """The half-cheetah of the page, whose action and observation are arrays."""
     model = Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml"
     shutil.copy(model, folder)
-    (folder / "cheetah.py").write_text(CHEETAH)
-    sensor = {"sensor": "data", "element": ["qpos[1:]", "qvel"], "rate": 20}
-    node = {
-        "name": "cheetah",
-        "container": "neuros_mujoco",
-        "plugin": "cheetah.py",
-        "inputs": [{"name": "action", "type": "float64[6]", "mujoco": {"actuators": "all"}}],
-        "outputs": [{"name": "observation", "type": "float64[17]", "mujoco": sensor}],
-    }
-    (folder / "project.json").write_text(json.dumps({"nodes": [node]}))
+    page = SIMULATORS.read_text("utf-8").partition("### Arrays\n")[2]
+    node, plugin = re.findall(r"```(?:json|python)\n(.*?)```", page, re.DOTALL)[:2]
+    (folder / "cheetah.py").write_text(plugin)
+    (folder / "project.json").write_text(f'{{"nodes": [{node}]}}')
     return folder
 
 
@@ -627,6 +598,7 @@ def test_a_cheetah_of_arrays_is_bare_mujoco_bit_for_bit(tmp_path: Path) -> None:
     for _ in range(2):
         observation, _ = env.reset()
         bare = mujoco.MjData(model)
+        mujoco.mj_step(model, bare, nstep=5)  # without an action
         assert np.array_equal(observation, np.concatenate([bare.qpos[1:], bare.qvel]))
         for action in np.random.default_rng(1).uniform(-1, 1, (100, 6)):
             observation = env.step(action)[0]

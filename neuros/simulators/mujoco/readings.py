@@ -200,7 +200,7 @@ class Data(Sensor):
             self._data, self._parts = data, self._parts_of(data)
         self._time[0] = data.time
         # mj_forward leaves these out unless a sensor of the model needs them.
-        if self._is_after_constraint and not data.flg_rnepost:
+        if self._is_after_constraint and not getattr(data, "flg_rnepost", False):
             mujoco.mj_rnePostConstraint(self.model, data)
         _fill_rows(packet, self._parts)
 
