@@ -135,13 +135,13 @@ class ArrayCodec:
 
         message = getattr(msg, kind.message.rpartition("/")[2])
         self._kind, self._plain = kind, message_codec(message)
-        self._dtype = numpy.dtype(kind.dtype)
+        self._dtype, self._is_bool = numpy.dtype(kind.dtype), kind.dtype == "bool"
         example = message()
         for place, size in enumerate(kind.shape):
             dimension = msg.MultiArrayDimension(size=size, stride=prod(kind.shape[place:]))
             example.layout.dim.append(dimension)
         self.rest = self._plain.encode(example)
-        code = "B" if kind.dtype == "bool" else self._dtype.char
+        code = "B" if self._is_bool else self._dtype.char
         self.typecode = next(c for c in "bBhHiIqQfd" if numpy.dtype(c) == numpy.dtype(code))
         example.data = array(self.typecode, bytes(self._dtype.itemsize))
         first = self._plain.encode(example)
@@ -160,7 +160,7 @@ class ArrayCodec:
     def decode(self, data: bytes) -> Any:
         """A read-only array."""
         # DDS pads a message to a multiple of four bytes.
-        if data.startswith(self._prefix) and len(data) - self._end in range(4):
+        if data.startswith(self._prefix) and 0 <= len(data) - self._end < 4:
             return self.of_numbers(data, len(self._prefix))
         message = self._plain.decode(data)
         if (why := self._misfit(message)) is not None:
@@ -169,12 +169,11 @@ class ArrayCodec:
 
     def of_numbers(self, data: Any, start: int) -> Any:
         """The array with these bytes from ``start`` on, without a copy where they are aligned."""
-        found = numpy.frombuffer(data, self._dtype, self._kind.size, start)
-        if self._kind.dtype == "bool" and (found.view(numpy.uint8) > 1).any():
+        found: Any = numpy.ndarray(self._kind.shape, self._dtype, data, start)
+        if self._is_bool and (found.view(numpy.uint8) > 1).any():
             raise WrongBytes(self._kind, data, "it has numbers other than 0 and 1")
         if not found.flags.aligned:
             found = found.copy()
-        found = found.reshape(self._kind.shape)
         found.flags.writeable = False
         return found
 
