@@ -49,8 +49,7 @@ def session(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Session]
     }
     node = {"name": "cart", "container": "neuros_python", "plugin": "cart.py", **ports}
     (tmp_path / "project.json").write_text(json.dumps({"nodes": [node]}))
-    with pytest.warns(UserWarning, match="is not connected"):
-        project = neuros.Project.from_file(tmp_path)
+    project = neuros.Project.from_file(tmp_path)
     with project.session(backend=request.param, output=tmp_path / "run") as session:
         yield session
 

@@ -552,7 +552,6 @@ def _upright_s(example: Path, folder: Path, seeds: Sequence[int]) -> list[float]
 
 # ---------------------------------------------------------------------- ports of arrays
 
-UNCONNECTED = pytest.mark.filterwarnings("ignore:.*is not connected")
 # Of Gymnasium's model.
 DEPRECATED = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
 SIMULATORS = ROOT / "docs" / "simulators.md"
@@ -580,7 +579,6 @@ def run_cheetah(folder: Path, **others: Any) -> gymnasium.Env[Any, Any]:
 
 
 @DEPRECATED
-@UNCONNECTED
 def test_ports_of_arrays_have_spaces_of_their_type_and_shape(tmp_path: Path) -> None:
     env = run_cheetah(tmp_path)
     assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float64)
@@ -592,7 +590,6 @@ def test_ports_of_arrays_have_spaces_of_their_type_and_shape(tmp_path: Path) -> 
 
 
 @DEPRECATED
-@UNCONNECTED
 def test_a_cheetah_of_arrays_is_bare_mujoco_bit_for_bit(tmp_path: Path) -> None:
     import mujoco
 
@@ -612,7 +609,6 @@ def test_a_cheetah_of_arrays_is_bare_mujoco_bit_for_bit(tmp_path: Path) -> None:
     env.close()
 
 
-@UNCONNECTED
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
@@ -638,7 +634,6 @@ def show(node, on, level):
 """
 
 
-@UNCONNECTED
 def test_arrays_of_bools_and_whole_numbers_and_any_shape(tmp_path: Path) -> None:
     (tmp_path / "mirror.py").write_text(MIRROR)
     types = {"on": "bool[2]", "level": "uint8[4]", "is_on": "bool[2]", "image": "float32[2,2]"}
