@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 
+from neuros.api.kept import Sources, find_sources, given_sources
 from neuros.api.request import Duration, Request
 from neuros.backends.node_command import place, usable_cores, without_mark
 from neuros.backends.pythons import Pythons, require_one_python
@@ -120,6 +121,7 @@ class Plan:
 
     Attributes:
         is_held: whether a session steps the run.
+        restored: what nodes get back that their plugins have kept.
     """
 
     project: Project
@@ -130,6 +132,7 @@ class Plan:
     network: Network = THIS_MACHINE
     messages: Messages | None = None
     is_held: bool = False
+    restored: Sources = field(default_factory=dict)
 
     @property
     def elsewhere(self) -> tuple[str, ...]:
@@ -190,10 +193,13 @@ class Plan:
         lists = _LISTS * max(1, len(self.project.connections))
         list_bytes = self.request.packet_log_bytes // lists
         return [
-            replace(f, messages=paths, list_bytes=list_bytes)
+            replace(f, messages=paths, list_bytes=list_bytes, restored=self._restored_to(f.node))
             for f in files
             if f.node.name in self.names
         ]
+
+    def _restored_to(self, node: Node) -> dict[str, str]:
+        return {name: str(file) for name, file in self.restored.get(node.name, {}).items()}
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
         """The launcher of the back end; it reports its processes to ``reaper``."""
@@ -252,12 +258,17 @@ def make_plan(
         chosen = _choose_machines(project, Path(request.deployment), request)
         nodes = [node for node in nodes if node.name not in chosen.deployment.places]
         network = Network(bool(chosen.deployment.places))
+    restored = find_sources(given_sources(request.restore), names)
+    if far := [name for name in restored if name in chosen.deployment.places]:
+        raise UsageError(
+            f"restore: '{far[0]}' runs on another machine: only nodes here can have it"
+        )
     back_end = chosen.back_end
     if back_end.is_one_process:
         _check_reach(project, names, back_end)
     has_pythons = not (back_end.is_one_process or back_end.has_own_pythons)
     pythons = Pythons.choose(nodes if has_pythons else [], project.folder, os.environ)
-    plan = Plan(project, names, chosen, request, pythons, network, messages)
+    plan = Plan(project, names, chosen, request, pythons, network, messages, restored=restored)
     if back_end.is_one_process and network.is_wide and plan.is_partial:
         raise UsageError(
             f"--network with -n: the nodes of the {back_end.name} back end cannot reach nodes"

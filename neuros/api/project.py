@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.api.kept import given_sources
 from neuros.api.live import LiveRun
 from neuros.api.loading import (
     foreseen_failures,
@@ -240,7 +241,9 @@ class Project:
         is_local = options.backend == LOCAL and not options.needs_processes
         count = itertools.count(1)
 
-        def start(seed: int | None, settings: Mapping[str, Any]) -> Held:
+        def start(
+            seed: int | None, settings: Mapping[str, Any], restore: Mapping[str, Any]
+        ) -> Held:
             number, output = next(count), None
             if options.output is not None:  # out, out-2, out-3
                 output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
@@ -249,7 +252,10 @@ class Project:
             if isinstance(chosen, Mapping):
                 chosen = with_model_fields(self._loaded.project, chosen)
             given = [*override_texts(chosen), *override_texts(settings)]
-            own = replace(options, seed=seed, output=output, set=given, backend=backend)
+            restored = {**given_sources(options.restore), **restore}
+            own = replace(
+                options, seed=seed, output=output, set=given, backend=backend, restore=restored
+            )
             project, messages = self._load_for_run(own)
             held, inputs = with_session_inputs(project, options.take_over)
             run: HeldRun

@@ -97,11 +97,14 @@ class HeldRun(Protocol):
     def copy(self, type_name: str, content: Any) -> Any:
         """A packet of its own for the program, from the content that came with an answer."""
 
-    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def reset(
+        self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
+    ) -> bool:
         """Bring all nodes back to their start, paused; ``False`` if they cannot be, or have ended.
 
         Args:
             variables: of their environments that change, by node.
+            keep: names of the values of their plugins that survive, by node.
         """
 
     def look(self) -> Sequence[NodeStatus] | None:
@@ -189,13 +192,15 @@ class LaunchedRun:
     def copy(self, type_name: str, content: bytes) -> Any:
         return self._packets.decode(type_name, content)
 
-    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def reset(
+        self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
+    ) -> bool:
         def reset(link: SessionLink) -> WasReset | None:
             # A round that was given up may go on for ever: it ends as a free run does.
             at_rest = self.run_for(0.0, {}) if link.is_behind else link.advance(0, {}, None)
             if at_rest is None:
                 return None
-            link.send(Reset(variables))
+            link.send(Reset(variables, {node: tuple(names) for node, names in keep.items()}))
             return link.answer(WasReset)
 
         answer = self._after(reset)

@@ -28,6 +28,7 @@ from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.node.context import ContextSwitch
 from neuros.node.handle import NodeHandle
+from neuros.node.keeping import restore_values
 from neuros.node.node import NodeRuntime
 from neuros.node.plugin import no_module
 from neuros.project.load import load_project
@@ -180,6 +181,7 @@ class PluginHarness:
         environment: environment variables of the node.
         name: the node's name.
         run_folder: the run folder, a temporary one if not given.
+        restore: values that the plugin gets back by ``node.keep``, by name.
 
     Raises:
         PluginError, HookError: if the plugin cannot be imported, or declares its hooks wrongly.
@@ -196,6 +198,7 @@ class PluginHarness:
         environment: Mapping[str, str] | None = None,
         name: str = "node",
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> None:
         path, module = Path(plugin).resolve(), ""
         if not path.exists() and is_module_name(os.fspath(plugin)):
@@ -214,7 +217,7 @@ class PluginHarness:
             module=module,
         )
         wires = with_neighbours(node, connections)
-        self._open(node, wires, path.parent, WORKSPACE, run_folder)
+        self._open(node, wires, path.parent, WORKSPACE, run_folder, restore)
 
     @classmethod
     def from_project(
@@ -226,6 +229,7 @@ class PluginHarness:
         overrides: Sequence[str] = (),
         workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> PluginHarness:
         """A node of a project, with its connections in that project.
 
@@ -247,7 +251,8 @@ class PluginHarness:
         node = _with_environment(loaded.node(node_name), environment)
         own = [c for c in loaded.connections if node_name in (c.source_node, c.destination_node)]
         harness = cls.__new__(cls)
-        harness._open(node, with_observer(node, own), loaded.folder, workspace, run_folder)
+        wires = with_observer(node, own)
+        harness._open(node, wires, loaded.folder, workspace, run_folder, restore)
         return harness
 
     @classmethod
@@ -259,6 +264,7 @@ class PluginHarness:
         environment: Mapping[str, str] | None = None,
         workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> PluginHarness:
         """The node that a node file describes; each port has a connection, as in the constructor.
 
@@ -276,7 +282,7 @@ class PluginHarness:
         node = _with_environment(loaded.nodes[0], environment)
         harness = cls.__new__(cls)
         wires = with_neighbours(node, connections)
-        harness._open(node, wires, file.parent, workspace, run_folder)
+        harness._open(node, wires, file.parent, workspace, run_folder, restore)
         return harness
 
     def _open(
@@ -286,6 +292,7 @@ class PluginHarness:
         project: Path,
         workspace: Path,
         run_folder: Path | None,
+        restore: Mapping[str, Any] | None,
     ) -> None:
         if run_folder is None:
             folder = Path(tempfile.mkdtemp(prefix="neuros-"))
@@ -294,7 +301,8 @@ class PluginHarness:
             folder = run_folder.resolve()
         messages = provide_messages(node, workspaces_of(project, workspace))
         folders = Folders(project, workspace, folder)
-        file = NodeFile(node, connections, folders, messages=messages)
+        restored = restore_values(restore or {}, folder / node.name)
+        file = NodeFile(node, connections, folders, messages=messages, restored=restored)
         self.log: list[Record] = []
         self.shutdown_reason: str | None = None
         self._file = file
@@ -391,6 +399,12 @@ class PluginHarness:
     def run_dir(self) -> Path:
         """The node's own folder."""
         return self._runtime.run_dir
+
+    @property
+    def kept(self) -> dict[str, Any]:
+        """What the plugin keeps (``node.keep``), by name: its values of now."""
+        with self._in_context():
+            return self._runtime.keeping.values()
 
     @property
     def time_s(self) -> float:

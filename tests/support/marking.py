@@ -38,6 +38,7 @@ REACHED = {
 # By the beginning of a test's path and name: what is reached through neuros, and what takes long.
 BY_NAME = {
     "ros": (
+        "api/test_kept_values.py",
         "api/test_python_api.py",
         "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
