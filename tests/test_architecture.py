@@ -104,6 +104,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "pytest_plugin": {"pytest"},
     "api.packets": {"numpy", "xxhash"},
     "api.run_record": {"tabulate"},
+    "api.session": {"numpy"},
     "api.verify": {"numpy", "xxhash"},
     "messages.package": {"catkin_pkg"},
     "messages.checking": {"rosidl_adapter"},

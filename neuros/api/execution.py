@@ -35,7 +35,7 @@ from neuros.backends.console import (
     format_record,
     wants_colours,
 )
-from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener
+from neuros.backends.control_sockets import UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
 from neuros.backends.reaper import Reaper
@@ -146,8 +146,6 @@ class Execution:
             stack.callback(reaper.finish)
             for file in self._listener.files:
                 reaper.remove_later(file)
-            if self._plan.is_held:
-                reaper.remove_later(self.folder / SESSION_SOCKET_NAME)
             return self._run(reaper, started)
 
     def _run(self, reaper: Reaper, started: float) -> dict[str, Any]:

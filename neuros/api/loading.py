@@ -97,6 +97,29 @@ def load_with_messages(
     return replace(loaded, warnings=(*loaded.warnings, *doubts)), messages
 
 
+def override_texts(settings: Mapping[str, Any] | Sequence[str] | None) -> tuple[str, ...]:
+    """Settings as texts of ``--set``: ``["nodes.a.environment.RATE=0.5"]``."""
+    if not isinstance(settings, Mapping):
+        return tuple(settings or ())
+    return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
+
+
+def value_text(path: str, value: Any) -> str:
+    """A value as text for ``--set``; ``None``, which removes the key, is empty.
+
+    Raises:
+        UsageError: if JSON has no such value.
+    """
+    if value is None:
+        return ""
+    if isinstance(value, str) and path.split(".")[2:3] == ["environment"]:
+        return value
+    try:
+        return json.dumps(value.tolist() if hasattr(value, "tolist") else value)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{path}: {error}") from error
+
+
 def seed_variables(project: Project, seed: int) -> dict[str, dict[str, str]]:
     """By node, the variables with SEED in their names in its environment, set to this seed.
 

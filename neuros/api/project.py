@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,7 @@ from neuros.api.loading import (
     foreseen_failures,
     load_with_messages,
     model_problems,
+    override_texts,
     seed_variables,
     with_model_fields,
 )
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from neuros.api.session import Session
 
 LOCAL, IN_PROCESS = "local", "in-process"
-_ENVIRONMENT = "environment"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,10 +88,18 @@ class SessionOptions(StartOptions):
         help="inputs that the session feeds in the place of their connections: robot.wheels",
     )
 
-    @property
-    def needs_processes(self) -> bool:
-        """Whether something is asked for that the nodes of a program's own thread do not have."""
-        return bool(self.recording or self.monitor_system_load or self.deployment or self.isolate)
+    def __post_init__(self) -> None:
+        asked = self.backend
+        super().__post_init__()
+        needs = ("record", "topics", "monitor_system_load", "deployment", "isolate")
+        given = [name for name in needs if getattr(self, name)]
+        if self.backend == LOCAL and given:
+            if asked == LOCAL:
+                raise UsageError(
+                    f"backend='local' with {', '.join(given)}: that needs a run in processes of its"
+                    " own, such as backend='in-process'"
+                )
+            object.__setattr__(self, "backend", AUTO)
 
 
 class Project:
@@ -238,39 +246,44 @@ class Project:
         from neuros.api.session import Session
         from neuros.api.session_link import Held, HeldRun, LaunchedRun, with_session_inputs
 
-        is_local = options.backend == LOCAL and not options.needs_processes
+        if options.expose and options.backend != LOCAL:
+            raise UsageError(
+                f"expose: ROS tools see the topics of the back end {options.backend} anyway"
+            )
         count = itertools.count(1)
 
-        def start(
-            seed: int | None, settings: Mapping[str, Any], restore: Mapping[str, Any]
-        ) -> Held:
-            number, output = next(count), None
-            if options.output is not None:  # out, out-2, out-3
-                output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
-            backend = AUTO if options.backend == LOCAL else options.backend
-            chosen = options.set
-            if isinstance(chosen, Mapping):
-                chosen = with_model_fields(self._loaded.project, chosen)
-            given = [*override_texts(chosen), *override_texts(settings)]
-            restored = {**given_sources(options.restore), **restore}
-            own = replace(
-                options, seed=seed, output=output, set=given, backend=backend, restore=restored
-            )
-            project, messages = self._load_for_run(own)
+        def prepare(
+            seed: int | None, settings: Mapping[str, Any]
+        ) -> Callable[[Mapping[str, Any]], Held]:
+            wanted = options.set
+            if isinstance(wanted, Mapping):
+                wanted = with_model_fields(self._loaded.project, wanted)
+            given = [*override_texts(wanted), *override_texts(settings)]
+            chosen = replace(options, seed=seed, set=given)
+            project, messages = self._load_for_run(chosen)
             held, inputs = with_session_inputs(project, options.take_over)
-            run: HeldRun
-            if is_local:
-                in_process = replace(own, backend=IN_PROCESS)
-                plan = replace(make_plan(held, messages, in_process), request=own)
-                make_environments(plan.pythons, messages, sys.stderr)
-                run = LocalRun(plan, messages.paths, exposes=options.expose)
-            else:
-                live = self._live(held, messages, own, is_held=True)
-                live.begin()
-                run = LaunchedRun(live, len(project.nodes))
-            return Held(run, project, frozenset(inputs), messages.paths)
 
-        return Session(start, options.seed)
+            def start(restore: Mapping[str, Any]) -> Held:
+                number, output = next(count), None
+                if options.output is not None:  # out, out-2, out-3
+                    output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
+                restored = {**given_sources(options.restore), **restore}
+                own = replace(chosen, output=output, restore=restored)
+                run: HeldRun
+                if options.backend == LOCAL:
+                    plan = make_plan(held, messages, replace(own, backend=IN_PROCESS))
+                    make_environments(plan.pythons, messages, sys.stderr)
+                    plan = replace(plan, request=own)
+                    run = LocalRun(plan, messages.paths, exposes=options.expose)
+                else:
+                    live = self._live(held, messages, own, is_held=True)
+                    live.begin()
+                    run = LaunchedRun(live, len(project.nodes))
+                return Held(run, project, frozenset(inputs), messages.paths)
+
+            return start
+
+        return Session(prepare, options.seed)
 
     def __reduce__(self) -> tuple[type[Project], tuple[Path, dict[str, Any]]]:
         """Pickle the path: the files are read again."""
@@ -314,7 +327,7 @@ class Project:
         loaded, messages = load_with_messages(self._path, texts, *names)
         if options.seed is not None:
             texts += [
-                f"nodes.{node}.{_ENVIRONMENT}.{name}={value}"
+                f"nodes.{node}.environment.{name}={value}"
                 for node, variables in seed_variables(loaded.project, options.seed).items()
                 for name, value in variables.items()
             ]
@@ -324,26 +337,3 @@ class Project:
                 self._warned.add(warning)
                 warnings.warn(str(warning), stacklevel=3)
         return loaded.project, messages
-
-
-def override_texts(settings: Mapping[str, Any] | Sequence[str] | None) -> tuple[str, ...]:
-    """Settings as texts of ``--set``: ``["nodes.a.environment.RATE=0.5"]``."""
-    if not isinstance(settings, Mapping):
-        return tuple(settings or ())
-    return tuple(f"{path}={value_text(path, value)}" for path, value in settings.items())
-
-
-def value_text(path: str, value: Any) -> str:
-    """A value as text for ``--set``; ``None``, which removes the key, is empty.
-
-    Raises:
-        UsageError: if JSON has no such value.
-    """
-    if value is None:
-        return ""
-    if isinstance(value, str) and path.split(".")[2:3] == [_ENVIRONMENT]:
-        return value
-    try:
-        return json.dumps(value.tolist() if hasattr(value, "tolist") else value)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"{path}: {error}") from error

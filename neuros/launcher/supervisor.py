@@ -238,8 +238,6 @@ class Supervisor:
             case control.Heard(node, text):
                 self._peers.hear(node, text, time.monotonic())
             case control.Advance():
-                for packet in message.packets:
-                    self.observers.take(link, control.Deliver(*packet))
                 self.pause.step(message.rounds, is_driven=self._detector.is_driven)
                 self._settling.ask(link, message)
             case control.AtRest():

@@ -5,12 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neuros.control import Finalising, Message, Progress, Ready, Shutdown
+from neuros.control import AtRest, Finalising, Message, Progress, Ready, Shutdown
+from neuros.control.link import to_bytes
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
@@ -29,6 +31,10 @@ from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
 from neuros.ports import Middleware, PacketRecorder, Transport, Way
 from neuros.project.model import Connection, NodeFile, Port
+
+LAST_PACKETS = "last_packets"
+"""In the folder of a node of a session: its newest packets, when the run has ended."""
+_MOST_SAVED_BYTES = 1_000_000
 
 
 class NodeRuntime:
@@ -121,7 +127,7 @@ class NodeRuntime:
             instruments.append(self._recorder)
         self._on_initialised = on_initialised
         self._uninitialised = 0  # initialise hooks that have not run
-        self._is_held = is_held
+        self._is_held, self._is_local = is_held, is_local
         packets = middleware.packets
         copy_of = (lambda port: packets.copier(port.type)) if is_local else None
         self.histories = PacketHistories(packets.encode, copy_of)
@@ -294,6 +300,8 @@ class NodeRuntime:
             for name in self.keeping.names:
                 self._guard(partial(self.keeping.save, name))
         self._tell(Finalising(self.name, ""))
+        if self._is_held and not self._is_local:
+            self._save_packets()
         if self._recorder is not None:
             self._recorder.close()
         self._services.close()
@@ -320,27 +328,21 @@ class NodeRuntime:
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
 
     def deliver(self, input_name: str, data: bytes) -> None:
-        """A session sends a packet to one of its inputs.
-
-        Raises:
-            ControlError: if it is none of them.
-            ProtocolError: if the bytes are no message of its type.
-        """
-        port = next((p for p in self.file.node.inputs if p.name == input_name), None)
-        if port is None or port.external_topic is None:
-            raise ControlError(f"a packet came for '{self.name}.{input_name}', no session's input")
-        self.on_external_packet(port, self._middleware.packets.decode(port.type, data))
-
-    def deliver_if_right(self, input_name: str, data: bytes) -> None:
         """An observer sends a packet to an input of the session.
 
         What is none is refused in the log: an observer ends no run by a mistake.
         """
         try:
-            self.deliver(input_name, data)
+            port = next((p for p in self.file.node.inputs if p.name == input_name), None)
+            if port is None or port.external_topic is None:
+                text = f"a packet came for '{self.name}.{input_name}', no session's input"
+                raise ControlError(text)
+            packet = self._middleware.packets.decode(port.type, data)
         except (ControlError, ProtocolError, ValueError) as error:
             self._enter()  # the log is that of its own
             self._logger.warning(f"a packet for input '{input_name}' is refused: {error}")
+        else:
+            self.on_external_packet(port, packet)
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """The receiver of a connection has started on packets."""
@@ -396,6 +398,15 @@ class NodeRuntime:
         if not self._uninitialised:
             self.keeping.settle()
         self._on_initialised()
+
+    def _save_packets(self) -> None:
+        """Leave the newest packets for a session, which may want to see what led to the end."""
+        packets = {
+            f"{self.name}.{output}": (history.count, history.newest(_MOST_SAVED_BYTES))
+            for output, history in self.histories.by_output.items()
+        }
+        with suppress(OSError):  # a full disk is reported by what loses more by it
+            (self.run_dir / LAST_PACKETS).write_bytes(to_bytes(AtRest(0, {}, packets)))
 
     def _finalise_hooks(self, begin: Callable[[str], object] = lambda _: None) -> None:
         for spec in self.specs:

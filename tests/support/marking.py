@@ -39,7 +39,9 @@ REACHED = {
 BY_NAME = {
     "ros": (
         "api/test_kept_values.py",
+        "api/test_local_sessions.py",
         "api/test_python_api.py",
+        "api/test_reset_settings.py",
         "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
         "extensions/neuros-analysis/tests/test_report.py",
