@@ -251,6 +251,7 @@ def make_plan(
         if name not in known:
             raise UsageError(f"-n {name}: no such node; the project has {', '.join(known)}")
     names = tuple(name for name in known if not request.nodes or name in request.nodes)
+    restored = find_sources(given_sources(request.restore), names)
     nodes = [project.node(name) for name in names]
     if request.deployment is None:
         chosen = choose(request.backend or AUTO, project, nodes, request.backend_options or {})
@@ -258,11 +259,6 @@ def make_plan(
         chosen = _choose_machines(project, Path(request.deployment), request)
         nodes = [node for node in nodes if node.name not in chosen.deployment.places]
         network = Network(bool(chosen.deployment.places))
-    restored = find_sources(given_sources(request.restore), names)
-    if far := [name for name in restored if name in chosen.deployment.places]:
-        raise UsageError(
-            f"restore: '{far[0]}' runs on another machine: only nodes here can have it"
-        )
     back_end = chosen.back_end
     if back_end.is_one_process:
         _check_reach(project, names, back_end)
