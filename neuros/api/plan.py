@@ -192,14 +192,17 @@ class Plan:
         paths = self.messages.paths if self.messages else ()
         lists = _LISTS * max(1, len(self.project.connections))
         list_bytes = self.request.packet_log_bytes // lists
+        restored = {
+            node: {name: str(file) for name, file in values.items()}
+            for node, values in self.restored.items()
+        }
         return [
-            replace(f, messages=paths, list_bytes=list_bytes, restored=self._restored_to(f.node))
+            replace(
+                f, messages=paths, list_bytes=list_bytes, restored=restored.get(f.node.name, {})
+            )
             for f in files
             if f.node.name in self.names
         ]
-
-    def _restored_to(self, node: Node) -> dict[str, str]:
-        return {name: str(file) for name, file in self.restored.get(node.name, {}).items()}
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
         """The launcher of the back end; it reports its processes to ``reaper``."""

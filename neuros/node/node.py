@@ -389,15 +389,18 @@ class NodeRuntime:
         return self.engine
 
     def _note_ready(self) -> None:
-        if not self._uninitialised:
-            self.keeping.settle()
+        self._settle()
         self._tell(Ready(self.name))
 
     def _note_initialised(self) -> None:
         self._uninitialised -= 1
+        self._settle()
+        self._on_initialised()
+
+    def _settle(self) -> None:
+        """Put what waits into values that were kept, once all initialise hooks have run."""
         if not self._uninitialised:
             self.keeping.settle()
-        self._on_initialised()
 
     def _save_packets(self) -> None:
         """Leave the newest packets for a session, which may want to see what led to the end."""
