@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from api_projects import dice
+from replaying import replay
 from test_python_api import thrown
 from test_stepped_sessions import ACCEPTANCE, DEADLINE_S, EVERY_BACK_END
 
@@ -331,3 +332,14 @@ def test_a_node_file_tells_what_was_restored(tmp_path: Path, earlier: neuros.Run
     assert told["restored"] == {"weights": str(source)}
     copy = run.folder / "counter" / "restored" / "weights.npz"
     assert copy.read_bytes() == source.read_bytes()
+
+
+def test_a_replay_gives_a_node_what_was_restored_to_it(tmp_path: Path, earlier: neuros.Run) -> None:
+    end = "\n@neuros_finalise()\ndef end(node):\n    print('learnt', [*node.get_user_data()])\n"
+    plugin = ENDING.replace("import neuros_function", "import neuros_finalise, neuros_function")
+    run = learner(tmp_path, plugin + end).run(
+        backend="in-process", record=True, restore={WEIGHTS: earlier}, check=True
+    )
+    said = next(line for line in run.log("counter").splitlines() if line.startswith("learnt"))
+    assert str(2 * sum(thrown(1))) in said
+    assert said in replay(run.folder, "counter").stdout
