@@ -297,7 +297,7 @@ class NodeRuntime:
         self._enter()
         if runs_hooks and self.engine is not None:
             self._finalise_hooks(lambda name: self._tell(Finalising(self.name, name)))
-            for name in self.keeping.names:
+            for name in () if self._uninitialised else self.keeping.names:
                 self._guard(partial(self.keeping.save, name))
         self._tell(Finalising(self.name, ""))
         if self._is_held and not self._is_local:
