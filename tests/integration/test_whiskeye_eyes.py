@@ -23,9 +23,7 @@ SECONDS = 1
 TIMEOUT_S = 400.0
 
 
-def started(
-    variant: str, backend: str, cwd: Path, *flags: str, project: Path = WHISKEYE, **settings: object
-) -> Finished:
+def started(variant: str, backend: str, cwd: Path, *flags: str, **settings: object) -> Finished:
     """Run a project to its end, without windows; ``node__NAME=value`` sets an environment value.
 
     ``pcn__weights`` is a file with the weights that it takes.
@@ -38,7 +36,7 @@ def started(
             continue
         arguments += ["--set", f"nodes.{node}.environment.{variable}={value}"]
     options = {"cwd": cwd, "timeout_s": TIMEOUT_S, "NEUROS_GUI": "0"}
-    run = launch(project / f"{variant}.json", "--backend", backend, *arguments, **options)
+    run = launch(WHISKEYE / f"{variant}.json", "--backend", backend, *arguments, **options)
     assert run.exit_code == 0, run.output
     return run
 
