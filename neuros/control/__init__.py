@@ -310,6 +310,10 @@ class Activate(Message):
     """Start tick and function hooks: every node of the project is ready."""
 
 
+class StopHooks(Message):
+    """Start no further hook, and go on to receive."""
+
+
 class Stop(Message):
     """Start no further hook, finalise and end."""
 
@@ -448,7 +452,21 @@ FROM_NODES: Sequence[type[Message]] = (
     *(Explanation, Heard, NodeStatus, AtRest, WasReset),
 )
 TO_NODES: Sequence[type[Message]] = (
-    *(Begin, Activate, Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
+    *(
+        Begin,
+        Activate,
+        Probe,
+        Explain,
+        Drain,
+        StopHooks,
+        Stop,
+        Say,
+        Leave,
+        Pause,
+        Resume,
+        Step,
+        Look,
+    ),
     *(Advance, Deliver, Reset),
 )
 FROM_OBSERVERS: Sequence[type[Message]] = (

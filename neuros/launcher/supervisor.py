@@ -131,6 +131,7 @@ class Supervisor:
             output,
             signals,
             on_stop,
+            not self._peers.exist and _hears_what_nobody_counts(files),
         )
         self.pause = PauseState(self._channels.send, time.monotonic)
         if is_held:
@@ -385,3 +386,10 @@ class Supervisor:
             return
         if self._probing.look(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:
             self._shutdown.fail(self._probing.why_dead())
+
+
+def _hears_what_nobody_counts(files: Sequence[NodeFile]) -> bool:
+    """Whether some connection may lose packets, or some input has an external topic."""
+    connections = (c for file in files for c in file.connections)
+    inputs = (port for file in files for port in file.node.inputs)
+    return not all(c.is_reliable for c in connections) or any(p.external_topic for p in inputs)

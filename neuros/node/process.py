@@ -126,6 +126,9 @@ class NodeProcess:
                 self.post(self._activate)
             case control.Stop():
                 self.ask_to_stop()
+            case control.StopHooks():
+                for node in tuple(self._nodes):
+                    node.stop()
             case control.Leave():
                 self._peers.leave()
             case control.Say(text):

@@ -59,6 +59,7 @@ BY_NAME = {
         "conformance/test_conformance.py::test_what_once",
         "extensions/neuros-learn/tests/test_datasets.py",
         "extensions/neuros-learn/tests/test_gym_environments.py",
+        "extensions/neuros-learn/tests/test_gym_pictures.py",
         "integration/",
         "upgrades/test_upgrades.py",
     ),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import shutil
 import subprocess
@@ -37,16 +38,26 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
+def one() -> float:
+    return 1.0
+
+
+def has_fallen(observation: Any) -> bool:
+    return bool(abs(observation[POSITION][1]) > 0.2)
+
+
+CART_POLE: dict[str, Any] = {
+    "action": "policy.force",
+    "observation": OBSERVED,
+    "reward": one,
+    "done": has_fallen,
+    "model": "cart.xml",
+    "max_episode_steps": 50,
+}
+
+
 def cart_pole(**others: Any) -> gymnasium.Env[Any, Any]:
-    arguments: dict[str, Any] = {
-        "action": "policy.force",
-        "observation": OBSERVED,
-        "reward": lambda env: 1.0,
-        "done": lambda env: abs(env.observation[POSITION][1]) > 0.2,
-        "model": "cart.xml",
-        "max_episode_steps": 50,
-    }
-    return neuros.gym.make(EXAMPLE / "project.json", **(arguments | others))
+    return neuros.gym.make(EXAMPLE / "project.json", **(CART_POLE | others))
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +74,12 @@ def episode(env: gymnasium.Env[Any, Any], seed: int | None, steps: int = 5) -> l
     return [each[POSITION].tolist() for each in found]
 
 
-def test_the_checker_of_gymnasium_finds_no_fault(env: gymnasium.Env[Any, Any]) -> None:
+def test_the_checker_of_gymnasium_finds_no_fault() -> None:
+    made = cart_pole()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*Box observation space m.* is .*infinity")
-        check_env(env.unwrapped, skip_render_check=True)
+        check_env(made.unwrapped)
+    made.close()
 
 
 def test_a_seed_gives_one_sequence_of_episodes(env: gymnasium.Env[Any, Any]) -> None:
@@ -184,8 +197,8 @@ def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
         sensors,
         action=["robot.order", "robot.flag"],
         observation=["robot.scan.data[2,3]", "robot.imu", "robot.imu.angular_velocity"],
-        reward=lambda env: env.observation["robot.imu.angular_velocity"][2],
-        done=lambda env: env.session["robot.done"].packet.data,
+        reward=lambda observation: observation["robot.imu.angular_velocity"][2],
+        done=lambda session: session["robot.done"].packet.data,
         ranges={"robot.order": (-2, [1, 2, 3, 4, 5, 6])},
     )
     try:
@@ -233,6 +246,18 @@ def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
         ({"ranges": {"robot.order": 3}}, "range of robot.order: "),
         ({"ranges": {"robot.flag": (0, 300)}, "action": "robot.flag"}, "range of robot.flag: "),
         ({"model": "nothing.xml"}, "nothing.xml"),
+        ({"rendermode": "rgb_array"}, r"neuros\.gym\.make has no .*did you mean 'render_mode'\?"),
+        ({"ouput": "run"}, r"no argument 'ouput' \(did you mean 'output'\?\)"),
+        ({"rounds": 1, "sim_s": 0.1}, "rounds and sim_s are lengths of one step: give one of them"),
+        ({"rounds": 1.5}, "rounds=1.5: give a whole number"),
+        ({"take_over": "robot.flag"}, "no argument 'take_over'"),
+        ({"max_episode_steps": 0}, "max_episode_steps=0: give a whole number from 1 on"),
+        ({"max_episode_steps": 2.5}, "max_episode_steps=2.5: give a whole number"),
+        ({"max_episode_steps": "50"}, "max_episode_steps='50': give a whole number"),
+        ({"reward": lambda obs: 0.0}, "reward: there is nothing for its parameter 'obs' .*there"),
+        ({"done": lambda actions: False}, r"done: .*'actions' \(did you mean 'action'\?\)"),
+        ({"truncated": True}, "truncated: True is no function .*give a function of observation"),
+        ({"info": dict}, "info: <class 'dict'> is no function with known parameters"),
     ],
 )
 def test_what_cannot_be_is_said_with_what_can(
@@ -242,6 +267,184 @@ def test_what_cannot_be_is_said_with_what_can(
     with pytest.raises(UsageError, match=complaint):
         neuros.gym.make(sensors, **(arguments | changed))
     assert not (sensors / "runs").exists()
+
+
+@NOT_CONNECTED
+def test_functions_get_what_their_parameters_name(sensors: Path) -> None:
+    def gained(
+        action: Any, previous_observation: Any, observation: Any, scale: float = 2.0
+    ) -> float:
+        return scale * float(observation[2] - previous_observation[2]) - 0.5 * float(action[0])
+
+    env = neuros.gym.make(
+        sensors,
+        action="robot.order",
+        observation="robot.imu.angular_velocity",
+        reward=gained,
+        done=lambda env, action: env.action is not action,
+        truncated=lambda observation: observation[2] > 3.0,
+        info=lambda action, previous_observation, session: {
+            "first": previous_observation is None and action is None,
+            "sent": session["robot.done"].count,
+        },
+    )
+    try:
+        _, info = env.reset()
+        assert info == {"first": True, "sent": 1}
+        *_, reward, terminated, truncated, info = env.step(np.array([3.0, 0, 0, 0, 0, 0]))
+        assert (reward, terminated, truncated) == (2.0 * (3.0 - 2.0) - 0.5 * 3.0, False, False)
+        assert info == {"first": False, "sent": 2}
+        *_, truncated, info = env.step(np.array([3.5, 0, 0, 0, 0, 0]))
+        assert truncated
+    finally:
+        env.close()
+
+
+@NOT_CONNECTED
+@pytest.mark.parametrize(
+    ("changed", "complaint"),
+    [
+        ({"reward": lambda: None}, "reward returned None, which is no number"),
+        ({"reward": lambda observation: "much"}, "reward returned 'much', which is no number"),
+        (
+            {"info": lambda action: {} if action is None else 3},
+            "info returned 3, which is no mapping",
+        ),
+    ],
+)
+def test_what_a_function_must_return_is_said(
+    sensors: Path, changed: dict[str, Any], complaint: str
+) -> None:
+    arguments = {"action": "robot.order", "observation": "robot.done", "reward": float}
+    env = neuros.gym.make(sensors, **(arguments | changed))
+    try:
+        env.reset()
+        with pytest.raises(UsageError, match=complaint):
+            env.step(np.zeros(6))
+    finally:
+        env.close()
+
+
+class TestOptionsOfAReset:
+    @pytest.mark.parametrize(
+        ("options", "complaint"),
+        [
+            ({"nonsense": 1}, "reset: there is no option 'nonsense'; settings are options=.*set"),
+            ({"set": {}, "seed": 3}, "reset: there is no option 'seed'"),
+            (
+                {"set": "nodes.cart.environment.MASS=2"},
+                "'set' is a mapping of settings, not 'nodes",
+            ),
+        ],
+    )
+    def test_that_there_are_not_are_refused(
+        self, env: gymnasium.Env[Any, Any], options: dict[str, Any], complaint: str
+    ) -> None:
+        before = episode(env, 7)
+        episode(env, 7)
+        random = env.unwrapped.np_random.bit_generator.state
+        with pytest.raises(UsageError, match=complaint):
+            env.reset(seed=1, options=options)
+        assert env.unwrapped.np_random.bit_generator.state == random
+        assert episode(env, 7) == before
+
+    def test_settings_hold_until_the_next_reset(self, env: gymnasium.Env[Any, Any]) -> None:
+        def speed(options: dict[str, Any] | None) -> float:
+            env.reset(seed=7, options=options)
+            return float(env.step(np.array([1.0]))[0][VELOCITY][0])
+
+        usual = speed(None)
+        slack = speed({"set": {"cart.model.actuator_gear": 0.0}})
+        assert usual > slack + 0.1
+        assert [speed(options) for options in (None, {}, {"set": None}, {"set": {}})] == 4 * [usual]
+
+    def test_a_setting_of_a_node_that_there_is_not_is_refused(
+        self, env: gymnasium.Env[Any, Any]
+    ) -> None:
+        with pytest.raises(UsageError, match=r"no node 'card' \(did you mean 'cart'\?\)"):
+            env.reset(options={"set": {"card.model.actuator_gear": 0.0}})
+
+
+class TestRegistration:
+    """Environments by a name, as Gymnasium makes them."""
+
+    ID = "neuros/CartPole-v3"
+
+    @pytest.fixture(autouse=True)
+    def _registered(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+        monkeypatch.chdir(EXAMPLE)
+        neuros.gym.register(self.ID, "project.json", **CART_POLE)
+        monkeypatch.undo()  # back in the folder of the test
+        yield
+        del gymnasium.registry[self.ID]
+
+    @pytest.fixture(autouse=True)
+    def _infinite(self) -> Iterator[None]:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*Box observation space m.* is .*infinity")
+            yield
+
+    def test_a_name_makes_the_environment_in_any_folder(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, env: gymnasium.Env[Any, Any]
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        made = gymnasium.make(self.ID, max_episode_steps=3)
+        try:
+            assert episode(made, 7, steps=3) == episode(env, 7, steps=3)
+            assert made.spec is not None
+            assert made.spec.id == self.ID
+            assert made.spec.max_episode_steps == 3
+        finally:
+            made.close()
+
+    @pytest.mark.acceptance
+    def test_a_specification_survives_pickling_and_makes_the_same_environment(
+        self, env: gymnasium.Env[Any, Any]
+    ) -> None:
+        for known in (gymnasium.spec(self.ID), env.spec):
+            made = pickle.loads(pickle.dumps(known)).make(output=None)
+            try:
+                assert episode(made, 7) == episode(env, 7)
+                assert made.spec.max_episode_steps == 50
+            finally:
+                made.close()
+
+    @pytest.mark.acceptance
+    @pytest.mark.parametrize(("mode", "more"), [("sync", {}), ("async", {"context": "spawn"})])
+    def test_a_vector_has_a_run_for_each(
+        self,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        mode: str,
+        more: dict[str, Any],
+        env: gymnasium.Env[Any, Any],
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        envs = gymnasium.make_vec(self.ID, num_envs=2, vectorization_mode=mode, vector_kwargs=more)
+        try:
+            seen, _ = envs.reset(seed=[7, 8])
+            found = [each.tolist() for each in seen[POSITION]]
+        finally:
+            envs.close()
+        assert found == [episode(env, seed, steps=0)[0] for seed in (7, 8)]
+
+    def test_a_project_of_any_name_has_a_specification(self, tmp_path: Path) -> None:
+        folder = shutil.copytree(EXAMPLE, tmp_path / "der Läufer: v2 (alt)")
+        made = neuros.gym.make(folder, **CART_POLE)
+        try:
+            assert made.spec is not None
+            assert made.spec.id == "neuros/der_Läufer__v2__alt_-v0"
+        finally:
+            made.close()
+
+    def test_an_argument_that_there_is_not_is_refused_at_once(self) -> None:
+        with pytest.raises(UsageError, match=r"no argument 'actions' \(did you mean 'action'\?\)"):
+            neuros.gym.register("neuros/Other-v0", EXAMPLE, actions="policy.force")
+        assert "neuros/Other-v0" not in gymnasium.registry
+
+    def test_an_argument_of_gymnasium_make_that_there_is_not_is_refused(self) -> None:
+        with pytest.raises(UsageError, match=r"neuros\.gym\.make has no argument 'ranges_of'"):
+            gymnasium.make(self.ID, ranges_of={})
 
 
 @pytest.mark.acceptance
