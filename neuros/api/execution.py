@@ -62,7 +62,7 @@ class Execution:
         stream: where the run is shown, ``None``: nowhere.
         signals: numbers of the signals that have arrived; signal handlers append to it.
         waker: bytes arrive here with each signal and each wish.
-        wishes: reasons for which this program ends the run, drained.
+        wishes: reason and exit code of each end that this program asks for.
         views: viewers that show the run while it goes on.
 
     Raises:
@@ -76,7 +76,7 @@ class Execution:
         stream: TextIO | None,
         signals: list[int],
         waker: socket.socket,
-        wishes: Sequence[str] = (),
+        wishes: list[tuple[str, int]] | None = None,
         views: Sequence[View] = (),
     ) -> None:
         self._plan = plan
@@ -98,7 +98,7 @@ class Execution:
             self._domain = run_domain(plan, self._recording_plan)
             stack.callback(self._domain.release)
             self.folder = make_run_folder(plan.request.output, plan.project.name)
-            self._files = write_node_files(plan, self.folder)
+            self._plan, self._files = write_node_files(plan, self.folder)
             self._listener = plan.deployment.control_listener(self.folder) or UnixListener(
                 self.folder
             )

@@ -18,11 +18,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar
 
+from neuros.api.live import why_it_ended
 from neuros.api.plan import Plan
 from neuros.api.run import Run
 from neuros.api.run_folder import make_run_folder, save_record, write_node_files
 from neuros.api.run_record import judge, run_record, run_table
-from neuros.api.session_link import why_it_ended
 from neuros.backends.console import format_record
 from neuros.control import AtRest, Message, NodeStatus, Ready, Shutdown
 from neuros.errors import NeurosError, UsageError
@@ -77,7 +77,7 @@ class LocalRun:
         self._run_id = os.urandom(8).hex()
         self._git = GitState(project.folder)
         self.folder = make_run_folder(request.output, project.name)
-        self._files = write_node_files(plan, self.folder)
+        _, self._files = write_node_files(plan, self.folder, keeps_functions=True)
         self._outcome = Outcome()
         self._declarations = Declarations(self._files)
         self._ready: set[str] = set()

@@ -24,16 +24,15 @@ from typing import Any
 
 import numpy as np
 
+from neuros.api.live import PROGRAM_FAILED, why_it_ended
 from neuros.api.loading import seed_variables, value_text, with_model_fields
 from neuros.api.run import Run
 from neuros.api.run_record import run_table
 from neuros.api.session_link import (
-    PROGRAM_FAILED,
     Held,
     connections_to,
     declared_at,
     port_of,
-    why_it_ended,
 )
 from neuros.control import AtRest, NodeStatus
 from neuros.errors import NeurosError, RunError, UsageError
@@ -624,19 +623,26 @@ class PacketProbe:
         self.packets: list[Any] = []
         self.dropped = 0
         self._type = port.type
+        self._has_fields = port.array is None
         self._every = every
         self._count = 0
 
     def __len__(self) -> int:
         return len(self.packets)
 
-    def array(self, field: str) -> np.ndarray[Any, np.dtype[Any]]:
+    def array(self, field: str = "") -> np.ndarray[Any, np.dtype[Any]]:
         """One field of all packets, ``linear_acceleration.x``: an array, a row per packet.
+
+        Without a field: all packets of a port of arrays.
 
         Raises:
             UsageError: if packets have no such field, or its lengths differ.
         """
+        if not field and not self._has_fields:
+            return np.array(self.packets)
         try:
+            if not (field and self._has_fields):
+                raise AttributeError
             rows = [np.asarray(operator.attrgetter(field)(packet)) for packet in self.packets]
         except AttributeError:
             raise UsageError(f"{self.name}: {self._type} has no field '{field}'") from None

@@ -36,8 +36,6 @@ from neuros.project.scanner import display_name, place_of, read_bytes
 from neuros.project.suggest import did_you_mean
 from neuros.transport.messages import RosPackets
 
-PROGRAM_FAILED = 1
-"""The exit code of a run whose program has failed."""
 _CONNECT_S = 0.01
 _Answer = TypeVar("_Answer")
 
@@ -220,7 +218,7 @@ class LaunchedRun:
         self._live.stop(reason)
 
     def interrupt(self, reason: str, exit_code: int) -> None:
-        self._live.interrupt()
+        self._live.fail(reason, exit_code)
 
     def wait(self) -> Run:
         if self._run is None:
@@ -352,11 +350,5 @@ def port_of(project: Project, name: str, *, is_input: bool) -> tuple[Node, Port]
 def declared_at(node: Node) -> str:
     """Where a node is declared, for messages."""
     line, column = place_of(node.file, node.pointer)
-    return f"node '{node.name}' is declared in {display_name(node.file)}:{line}:{column}"
-
-
-def why_it_ended(error: BaseException) -> tuple[str, int]:
-    """The reason and the exit code of a run whose program fails."""
-    if isinstance(error, KeyboardInterrupt):
-        return "ended by Ctrl+C", 130
-    return f"the program failed: {type(error).__name__}: {error}", PROGRAM_FAILED
+    place = f":{line}:{column}" if line else ""
+    return f"node '{node.name}' is declared in {display_name(node.file)}{place}"

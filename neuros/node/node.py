@@ -18,7 +18,7 @@ from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
 from neuros.errors import ControlError, HookError, NeurosError, ProtocolError
-from neuros.hooks import HookKind, HookSpec
+from neuros.hooks import HookKind, HookSpec, hook_specs_of
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices, Results
@@ -94,8 +94,11 @@ class NodeRuntime:
         self._tell = tell
         self._contexts = contexts
         environment = self._environment({})
-        plugin = None if file.node.module else file.node.plugin
-        self._context = contexts.make_context(environment, plugin, file.folders.project, log_file)
+        are_functions = bool(file.node.hooks)
+        plugin = None if file.node.module or are_functions else file.node.plugin
+        self._context = contexts.make_context(
+            *(environment, plugin, file.folders.project, log_file), shares_modules=are_functions
+        )
         self._enter = partial(contexts.enter, self._context)
         self._enter()
         self._transport = middleware.transport(file)
@@ -222,7 +225,8 @@ class NodeRuntime:
             return "packets are recorded"
         if self._resets:
             return ""
-        if node.module or not node.plugin.is_relative_to(self.file.folders.project):
+        is_own = node.hooks or node.plugin.is_relative_to(self.file.folders.project)
+        if node.module or not is_own:
             return f"the plugin of {self.name} is not in the project's folder"
         if self._middleware.has_foreign_entities(self.file):
             return f"the plugin of {self.name} has made ROS entities"
@@ -249,7 +253,8 @@ class NodeRuntime:
             self._services.close()
             self.handle.set_user_data(None)
         environment = self._environment(variables)
-        self._contexts.renew(self._context, environment, forgets_modules=not is_kept)
+        forgets = not is_kept and not self.file.node.hooks
+        self._contexts.renew(self._context, environment, forgets_modules=forgets)
         self._enter()
         self._time.begin_anew(keeps_owner=is_kept)
         self._services.results.clear()
@@ -370,10 +375,11 @@ class NodeRuntime:
     def _load_plugin(self) -> None:
         node = self.file.node
         for port in (*node.inputs, *node.outputs):  # the plugin may make messages when imported
-            self._middleware.packets.message_class(port.type)
-        self.specs = self._plugin = with_clocks(
-            node, load_plugin(node.plugin, self.name, node.module)
-        )
+            self._middleware.packets.packet_class(port.type)
+        specs: Sequence[HookSpec] = hook_specs_of(dict(enumerate(node.hooks)))
+        if not node.hooks:
+            specs = load_plugin(node.plugin, self.name, node.module)
+        self.specs = self._plugin = with_clocks(node, specs)
 
     def _make(self) -> Engine:
         """The engine for the hooks of now."""
@@ -423,10 +429,10 @@ class NodeRuntime:
 
     def _packet_type(self, port: Port) -> PacketType:
         packets = self._middleware.packets
-        kind = packets.message_class(port.type)
         own = [c for c in self.file.connections if c.source_node == self.file.node.name]
         for_jpeg = any(c.is_jpeg for c in own if c.source_output == port.name)
-        return PacketType(kind, packets.checker(kind, for_jpeg=for_jpeg))
+        check = packets.checker(port.type, for_jpeg=for_jpeg)
+        return PacketType(packets.packet_class(port.type), check)
 
     @property
     def _loaded(self) -> Engine:

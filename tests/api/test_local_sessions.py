@@ -25,7 +25,6 @@ from neuros.api.local_run import NAME
 from neuros.api.session import Session
 from neuros.errors import HookError, RunError, UsageError
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*is not connected")
 DEADLINE_S = 60.0
 
 LOOKS_AROUND = """

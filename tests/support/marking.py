@@ -38,6 +38,7 @@ REACHED = {
 # By the beginning of a test's path and name: what is reached through neuros, and what takes long.
 BY_NAME = {
     "ros": (
+        "api/test_arrays_in_programs.py::test_a_session",
         "api/test_kept_values.py",
         "api/test_local_sessions.py",
         "api/test_python_api.py",
