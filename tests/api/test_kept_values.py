@@ -19,6 +19,7 @@ from containers import require_containers
 from neuros.api.session import Session
 from neuros.cli.main import main
 from neuros.errors import RunError, UsageError
+from neuros.hooks import neuros_initialise, neuros_tick
 from neuros.node.keeping import encoded
 
 LEARNER = """
@@ -192,6 +193,32 @@ def test_each_recorded_episode_keeps_its_own(tmp_path: Path) -> None:
     (first,) = s.runs
     assert learnt(first) == [sum(thrown(1)[:3]), 3]
     assert learnt(s.close()) == [sum([*thrown(1)[:3], *thrown(2)[:2]]), 5]
+
+
+@neuros_initialise()
+def begin(node: Any) -> None:
+    own = {"sum": 0}
+    node.set_user_data(own)
+    node.keep("sum", lambda: own["sum"], lambda kept: own.update(sum=kept))
+
+
+@neuros_tick(seconds=1000.0)  # each step lets it start
+def add(node: Any) -> None:
+    node.get_user_data()["sum"] += 1
+
+
+@pytest.mark.parametrize("back_end", ["local", "in-process"])
+def test_functions_as_plugins_keep_as_files_do(back_end: str) -> None:
+    project = neuros.Project(nodes=[neuros.Node("counter", plugin=[begin, add])], connections=[])
+    with project.session(backend=back_end) as s:
+        step(s, 3)
+        s.reset(keep="counter.sum")
+        step(s, 2)
+    with project.session(backend=back_end, restore={"counter.sum": s.close()}) as again:
+        step(again, 1)
+        again.reset()
+        step(again, 2)
+    assert (s.close().kept("counter.sum"), again.close().kept("counter.sum")) == (5, 7)
 
 
 # ------------------------------------------------------------------ the command line
