@@ -190,7 +190,9 @@ class LocalRun:
             return None
         return [node.reports.look({}, 0) for node in self._nodes.values()]
 
-    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def reset(
+        self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
+    ) -> bool:
         """Bring all nodes back to their start, if they can be; see :meth:`HeldRun.reset`."""
         nodes = self._nodes.values()
         if self._run is not None or any(node.why_not_reset for node in nodes):
@@ -202,7 +204,7 @@ class LocalRun:
             self._loop.run_until_idle()
             for node in nodes:
                 try:
-                    node.reset(variables.get(node.name, {}))
+                    node.reset(variables.get(node.name, {}), keep.get(node.name, ()))
                 except NeurosError as error:
                     self._fail(node.name, error)
                     break

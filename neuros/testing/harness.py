@@ -28,6 +28,7 @@ from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.node.context import ContextSwitch
 from neuros.node.handle import NodeHandle
+from neuros.node.keeping import restore_values
 from neuros.node.node import NodeRuntime
 from neuros.node.plugin import no_module
 from neuros.project.in_python import Plugin, functions_of, plugin_key
@@ -183,6 +184,7 @@ class PluginHarness:
         environment: environment variables of the node.
         name: the node's name.
         run_folder: the run folder, a temporary one if not given.
+        restore: values that the plugin gets back by ``node.keep``, by name.
 
     Raises:
         PluginError, HookError: if the plugin cannot be imported, or declares its hooks wrongly.
@@ -200,6 +202,7 @@ class PluginHarness:
         environment: Mapping[str, str] | None = None,
         name: str = "node",
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> None:
         hooks, module = functions_of(plugin), ""
         if hooks:
@@ -225,7 +228,7 @@ class PluginHarness:
         )
         wires = with_neighbours(node, connections)
         project = path.parent if path.exists() else Path.cwd()
-        self._open(node, wires, project, WORKSPACE, run_folder)
+        self._open(node, wires, project, WORKSPACE, run_folder, restore)
 
     @classmethod
     def from_project(
@@ -237,6 +240,7 @@ class PluginHarness:
         overrides: Sequence[str] = (),
         workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> PluginHarness:
         """A node of a project, with its connections in that project.
 
@@ -258,7 +262,8 @@ class PluginHarness:
         node = _with_environment(loaded.node(node_name), environment)
         own = [c for c in loaded.connections if node_name in (c.source_node, c.destination_node)]
         harness = cls.__new__(cls)
-        harness._open(node, with_observer(node, own), loaded.folder, workspace, run_folder)
+        wires = with_observer(node, own)
+        harness._open(node, wires, loaded.folder, workspace, run_folder, restore)
         return harness
 
     @classmethod
@@ -270,6 +275,7 @@ class PluginHarness:
         environment: Mapping[str, str] | None = None,
         workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> PluginHarness:
         """The node that a node file describes; each port has a connection, as in the constructor.
 
@@ -287,7 +293,7 @@ class PluginHarness:
         node = _with_environment(loaded.nodes[0], environment)
         harness = cls.__new__(cls)
         wires = with_neighbours(node, connections)
-        harness._open(node, wires, file.parent, workspace, run_folder)
+        harness._open(node, wires, file.parent, workspace, run_folder, restore)
         return harness
 
     def _open(
@@ -297,6 +303,7 @@ class PluginHarness:
         project: Path,
         workspace: Path,
         run_folder: Path | None,
+        restore: Mapping[str, Any] | None,
     ) -> None:
         if run_folder is None:
             folder = Path(tempfile.mkdtemp(prefix="neuros-"))
@@ -305,7 +312,8 @@ class PluginHarness:
             folder = run_folder.resolve()
         messages = provide_messages(node, workspaces_of(project, workspace))
         folders = Folders(project, workspace, folder)
-        file = NodeFile(node, connections, folders, messages=messages)
+        restored = restore_values(restore or {}, folder / node.name)
+        file = NodeFile(node, connections, folders, messages=messages, restored=restored)
         self.log: list[Record] = []
         self.shutdown_reason: str | None = None
         self._file = file
@@ -402,6 +410,12 @@ class PluginHarness:
     def run_dir(self) -> Path:
         """The node's own folder."""
         return self._runtime.run_dir
+
+    @property
+    def kept(self) -> dict[str, Any]:
+        """What the plugin keeps (``node.keep``), by name: its values of now."""
+        with self._in_context():
+            return self._runtime.keeping.values()
 
     @property
     def time_s(self) -> float:
