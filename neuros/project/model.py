@@ -271,6 +271,11 @@ class NodeFile:
     names: Names = _NO_NAMES
     list_bytes: int = 64_000_000
 
+    @property
+    def logger_name(self) -> str:
+        """The name of its logger in ROS, which rcl makes from namespace and name."""
+        return f"{self.names.namespace}/{self.node.name}"[1:].replace("/", ".")
+
 
 @dataclass(frozen=True)
 class Budgets:
