@@ -25,6 +25,11 @@ class TestOneProcess(BackEndChecks):
     back_end = "in-process"
 
 
+class TestOneProcessWithoutRos(BackEndChecks):
+    back_end = "in-process"
+    options = ("--no-ros",)
+
+
 class TestContainers(BackEndChecks):
     back_end = "docker"
 
