@@ -188,12 +188,14 @@ class _Program:
 
     def __init__(self, file: Path, folder: Path, seconds: float, domain: int) -> None:
         command = [sys.executable, "-m", "tests.conformance.session_program"]
-        self._process = subprocess.Popen(
-            [*command, str(file), str(folder), str(seconds)],
-            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
-            cwd=_ROOT,
-            stderr=subprocess.DEVNULL,  # run.json says how it ended, also for a KeyboardInterrupt
-        )
+        self._log = file.with_name("program.log")
+        with self._log.open("w") as log:
+            self._process = subprocess.Popen(
+                [*command, str(file), str(folder), str(seconds)],
+                env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+                cwd=_ROOT,
+                stderr=log,
+            )
 
     @property
     def is_running(self) -> bool:
@@ -208,6 +210,12 @@ class _Program:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             raise TimeoutError from None
+
+    def kill(self) -> str:
+        """End it by force; returns where it stood."""
+        self._process.send_signal(signal.SIGABRT)
+        self._process.wait()
+        return self._log.read_text()
 
 
 def _wait(
@@ -229,6 +237,8 @@ def _wait(
         observed.is_overdue = True
         observed.ending_ns = observed.ending_ns or time.monotonic_ns()
         live.interrupt()
+    if isinstance(live, _Program) and not _has_ended(live, LONGEST_S):
+        observed.error = f"it does not end:\n{live.kill()}"
     live.wait(LONGEST_S)
 
 
