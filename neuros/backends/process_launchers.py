@@ -27,6 +27,10 @@ from neuros.project.model import Node, NodeFile, Project
 from neuros.stacks import ProcessThreads, threads_of
 
 
+WITHOUT_ROS = "local"
+"""The transport of nodes of one process that no ROS tool finds."""
+
+
 class ProcessBackEnd(BackEnd):
     """A process per node; the last choice of ``auto``."""
 
@@ -60,7 +64,7 @@ class InProcessBackEnd(BackEnd):
     def prepare(
         self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
     ) -> Deployment:
-        return InProcessDeployment(nodes, "" if options["ros"] else "local")
+        return InProcessDeployment(nodes, "" if options["ros"] else WITHOUT_ROS)
 
 
 ProcessOf: TypeAlias = "Callable[[NodeProgram, NodeFile, Mapping[str, str]], NodeProcess]"
