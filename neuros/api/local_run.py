@@ -332,6 +332,7 @@ class LocalRun:
             because = f": {message.reason}" if message.reason else ""
             reason = f"{message.node} ended the project{because}"
             self._end = reason, message.drain_s, message.node
+            self._loop.end_run()
 
     def _fail(self, name: str, error: NeurosError) -> None:
         if name in self._nodes:
@@ -341,6 +342,7 @@ class LocalRun:
         self.error = self.error or error
         first_line = (str(error).strip() or "no reason was given").splitlines()[0]
         self._outcome.fail(f"node '{name}' failed: {first_line}")
+        self._loop.end_run()
         for node in self._nodes.values():
             node.stop()
 

@@ -26,7 +26,6 @@ from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Reaper
 from neuros.project.model import Node, NodeFile, Project
 from neuros.stacks import ProcessThreads, threads_of
 
-
 WITHOUT_ROS = "local"
 """The transport of nodes of one process that no ROS tool finds."""
 

@@ -208,7 +208,9 @@ class Engine:
         self._wake()
         self._lifecycle.drain(self.all_hooks[place] for place in last_round)
         self._cause = self.rest()
-        self.resume()
+        if self._pause.is_on:
+            self._pause.end(self._wake())
+            self._pass()
 
     def pause(self) -> None:
         """Start only initialise hooks and steps until :meth:`resume`.
@@ -221,10 +223,14 @@ class Engine:
         self._cause = self.rest()
 
     def resume(self) -> None:
-        """Go on after a pause."""
+        """Go on after a pause.
+
+        Hooks start with the next event: one that started now would hold the pause of the other
+        nodes in the thread.
+        """
         if self._pause.is_on:
             self._pause.end(self._wake())
-            self._pass()
+            self._end_pass()
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let each hook that starts unasked do so ``count`` times more.
@@ -377,6 +383,11 @@ class Engine:
                         self._run(hook)
             finally:
                 self._is_passing = False
+        self._end_pass()
+
+    def _end_pass(self) -> None:
+        """Find out what the node waits for; if for nothing, go on with a loop-back."""
+        lifecycle, pause = self._lifecycle, self._pause
         if lifecycle.is_stopped:
             self._cause = self.rest()
         elif pause.is_on:

@@ -63,6 +63,7 @@ class LocalLoop:
         self._has_arrived = threading.Event()
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._is_stopping = False
+        self._end_ns = 0
         self.ros: RosLoop | None = None
         self._leader: RosLoop | None = None  # handles all events, from some time on
         self.interruption: BaseException | None = None
@@ -141,20 +142,24 @@ class LocalLoop:
                 events.popleft()()
 
     def run_for(self, seconds: float) -> None:
-        """Handle events, timers and ROS for a time on the wall clock, or until :meth:`stop`.
+        """Handle events, timers and ROS for a time on the wall clock, or until :meth:`end_run`.
 
         Raises:
             BaseException: the :attr:`interruption`; the events that wait are kept.
         """
-        end_ns = self._clock() + round(seconds * 1e9)
+        self._end_ns = self._clock() + round(seconds * 1e9)
         ros_due_ns = 0
-        while not self._is_stopping and (now_ns := self._clock()) < end_ns:
+        while (now_ns := self._clock()) < self._end_ns:
             if self.interruption is not None:
                 self._raise_interruption()
             if self.ros is not None and now_ns >= ros_due_ns:
                 ros_due_ns = now_ns + round(_SLICE_S * 1e9)
                 self.ros.run_until_idle()
-            self._go_on(end_ns)
+            self._go_on(self._end_ns)
+
+    def end_run(self) -> None:
+        """End :meth:`run_for` after the current event."""
+        self._end_ns = 0
 
     def run(self) -> None:
         """Handle events and timers until :meth:`stop`; with ROS, in one queue with its events."""
