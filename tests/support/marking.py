@@ -38,6 +38,7 @@ REACHED = {
 # By the beginning of a test's path and name: what is reached through neuros, and what takes long.
 BY_NAME = {
     "ros": (
+        "api/test_free_runs.py",
         "api/test_python_api.py",
         "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
@@ -57,6 +58,8 @@ BY_NAME = {
         "extensions/neuros-learn/tests/test_datasets.py",
         "extensions/neuros-learn/tests/test_gym_environments.py",
         "integration/",
+        "runtime/test_local_loop.py::test_a_free_run_serves_ros",
+        "runtime/test_local_loop.py::test_events_timers_and_threads",
         "upgrades/test_upgrades.py",
     ),
     "process": (
