@@ -520,7 +520,7 @@ class _Thread:
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
         if not self._is_inside or self._loop.interruption is not None:
             signal.default_int_handler(number, frame)
-        self._loop.interruption = KeyboardInterrupt()
+        self._loop.interrupt(KeyboardInterrupt())
 
 
 def _is_main() -> bool:
@@ -561,7 +561,7 @@ class _Watchdog:
     def _watch(self) -> None:
         if self._is_over.wait(max(0.0, self._end_s - time.monotonic())):
             return
-        self._loop.interruption = TimeoutError("the run has not come to rest in time")
+        self._loop.interrupt(TimeoutError("the run has not come to rest in time"))
         if self._is_over.wait(_GRACE_S):
             return
         with self._lock:

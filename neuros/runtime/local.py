@@ -8,8 +8,10 @@ node. From then on, the loop serves ROS, too.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import queue
 import threading
 import time
 from collections import deque
@@ -51,7 +53,7 @@ class LocalLoop:
     Attributes:
         post: handle an event after all waiting events.
         ros: the loop of ROS, once there is one; see :meth:`serve`.
-        interruption: raised before the next event; any thread may set it.
+        interruption: raised before the next event; see :meth:`interrupt`.
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
@@ -59,8 +61,8 @@ class LocalLoop:
         self._events: deque[Event] = deque()
         self.post: Callable[[Event], None] = self._events.append
         self.post_loop_back = self.post
-        self._from_threads: deque[Event] = deque()
-        self._has_arrived = threading.Event()
+        # Also signal handlers post there, which the lock of threading.Event would hang.
+        self._from_threads: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._is_stopping = False
         self._end_ns = 0
@@ -80,13 +82,11 @@ class LocalLoop:
     def serve(self, ros: RosLoop) -> None:
         """Serve ROS from now on. Any thread."""
         self.ros = ros
-        self._has_arrived.set()
+        self.post_from_thread(_nothing)
 
     def post_from_thread(self, event: Event) -> None:
-        self._from_threads.append(event)
-        if self._leader is None:
-            self._has_arrived.set()
-        else:
+        self._from_threads.put(event)
+        if self._leader is not None:
             self._leader.post_from_thread(self._post_arrived)
 
     def note_execution(self) -> None:
@@ -114,7 +114,8 @@ class LocalLoop:
 
     def step(self) -> bool:
         """Handle the oldest event; returns whether there was one."""
-        self._post_arrived()
+        while not self._from_threads.empty():
+            self._events.append(self._from_threads.get())
         if self._is_stopping or not self._events:
             return False
         self._events.popleft()()
@@ -128,13 +129,13 @@ class LocalLoop:
         """
         events, from_threads = self._events, self._from_threads
         while not self._is_stopping:
-            if from_threads:
-                events.append(from_threads.popleft())
+            if not from_threads.empty():
+                events.append(from_threads.get())
             elif not events:
                 if self.ros is None:
                     return
                 self.ros.run_until_idle()
-                if not (events or from_threads):
+                if not events and from_threads.empty():
                     return
             if self.interruption is not None:
                 self._raise_interruption()
@@ -176,18 +177,23 @@ class LocalLoop:
     def stop(self) -> None:
         """Handle no further event. Any thread."""
         self._is_stopping = True
-        self._has_arrived.set()
+        self.post_from_thread(_nothing)
         if self.ros is not None:
             self.ros.stop()
+
+    def interrupt(self, error: BaseException) -> None:
+        """Raise an error before the next event. Any thread, and a signal handler."""
+        self.interruption = error
+        self._from_threads.put(_nothing)
 
     def wait(self, seconds: float | None) -> None:
         """Wait for an event of another thread, or for ROS; not longer than this."""
         if self.ros is not None:
             self.ros.run_for(_SLICE_S if seconds is None else min(seconds, _SLICE_S))
             return
-        self._has_arrived.clear()
-        if not (self._from_threads or self._is_stopping):
-            self._has_arrived.wait(seconds)
+        if not self._is_stopping:  # else what tells of that may have been taken
+            with contextlib.suppress(queue.Empty):
+                self._events.append(self._from_threads.get(timeout=seconds))
 
     def _go_on(self, end_ns: int | None) -> None:
         """Handle the oldest event, or wait for one; then the timers that are due."""
@@ -212,13 +218,17 @@ class LocalLoop:
             ros.run()
 
     def _post_arrived(self) -> None:
-        while self._from_threads:
-            self.post(self._from_threads.popleft())
+        while not self._from_threads.empty():
+            self.post(self._from_threads.get())
 
     def _raise_interruption(self) -> None:
         interruption, self.interruption = self.interruption, None
         assert interruption is not None
         raise interruption
+
+
+def _nothing() -> None:
+    """An event that only wakes the loop."""
 
 
 _LEVELS = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -126,6 +127,17 @@ def test_neither_a_timer_that_is_always_overdue_nor_events_without_end_have_the_
     with overdue(loop):
         loop.run()
     thread.join()
+
+
+def test_a_signal_handler_interrupts_a_loop_that_waits() -> None:
+    loop = LocalLoop()
+    previous = signal.signal(signal.SIGALRM, lambda *_: loop.interrupt(KeyboardInterrupt()))
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.05)
+        with overdue(loop), pytest.raises(KeyboardInterrupt):
+            loop.run_for(TIMEOUT_S)
+    finally:
+        signal.signal(signal.SIGALRM, previous)
 
 
 def test_what_an_event_raises_ends_the_run_of_the_loop() -> None:
