@@ -371,10 +371,15 @@ class LocalRun:
             return
         outcome = self._outcome
         outcome.begin_to_end(time.monotonic())
+        interruption: KeyboardInterrupt | None = None
         try:
             if self._end is not None and not outcome.failures and self._is_active:
                 outcome.reason, drain_s, stopped = self._end
-                self._drain(drain_s, stopped)
+                try:
+                    self._drain(drain_s, stopped)
+                except KeyboardInterrupt as error:
+                    interruption = error
+                    outcome.fail("ended by Ctrl+C", EXIT_CODES[signal.SIGINT])
             with self._inside():
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
@@ -387,6 +392,8 @@ class LocalRun:
             atexit.unregister(self._end_with_program)
             self._record()
             self._run = Run(self.folder)
+        if interruption is not None:
+            raise interruption
 
     def _drain(self, drain_s: float, stopped: str) -> None:
         last_round = self._declarations.last_round(stopped)
