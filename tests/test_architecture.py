@@ -67,7 +67,13 @@ PACKAGES = (
 # neuros itself holds public names; every package may ask it for the version. Those of others
 # it imports when they are asked for.
 PUBLIC_NAMES = Package(2, ("",))
-OWNERS = {"Node": "node", "Project": "api", "Run": "api"}
+OWNERS = {
+    "Connection": "project",
+    "Node": "project",
+    "NodeHandle": "node",
+    "Project": "api",
+    "Run": "api",
+}
 PORTS = 3
 
 MESSAGES = {"builtin_interfaces", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"}
@@ -104,6 +110,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "pytest_plugin": {"pytest"},
     "api.packets": {"numpy", "xxhash"},
     "api.run_record": {"tabulate"},
+    "api.session": {"numpy"},
     "api.verify": {"numpy", "xxhash"},
     "messages.package": {"catkin_pkg"},
     "messages.checking": {"rosidl_adapter"},

@@ -81,8 +81,8 @@ RICH = [
     NodeStatus("a", 1, 2.0, LiveCounters(1.0, METRICS, {"c": (2, (7, 8))}, {"c": (1, 9)}), {}),
     Ended(0, "why", {"a": REPORT}, 2.0, 0.5, True),
     Finalising("a", None),
-    Advance(7, 2, {"a.o": 3}, (("a", "x", b"abcd"), ("a", "y", b""))),
-    AtRest(7, {"a": 0.25}, {"a.o": (4, bytes(200_000)), "a.p": (1, b"")}),
+    Advance(7, 2, {"a.o": 3}),
+    AtRest(7, {"a": 0.25}, {"a.o": (4, [bytes(200_000), b"x"]), "a.p": (1, [b""])}),
 ]
 
 

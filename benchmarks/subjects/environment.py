@@ -111,9 +111,10 @@ def times_of_neuros(steps: int) -> dict[str, float]:
             folder,
             action=f"cheetah.torques.data[{len(MOTORS)}]",
             observation=[f"cheetah.joints.{part}[{len(JOINTS)}]" for part in _PARTS],
-            reward=lambda env: 0.0,
+            reward=lambda: 0.0,
             model=MODEL.name,
             output=folder / "run",
+            backend="in-process",
         )
         return times(make, steps)
 

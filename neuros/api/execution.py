@@ -35,7 +35,7 @@ from neuros.backends.console import (
     format_record,
     wants_colours,
 )
-from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener
+from neuros.backends.control_sockets import UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
 from neuros.backends.process_launchers import WITHOUT_ROS
@@ -63,7 +63,7 @@ class Execution:
         stream: where the run is shown, ``None``: nowhere.
         signals: numbers of the signals that have arrived; signal handlers append to it.
         waker: bytes arrive here with each signal and each wish.
-        wishes: reasons for which this program ends the run, drained.
+        wishes: reason and exit code of each end that this program asks for.
         views: viewers that show the run while it goes on.
 
     Raises:
@@ -77,7 +77,7 @@ class Execution:
         stream: TextIO | None,
         signals: list[int],
         waker: socket.socket,
-        wishes: Sequence[str] = (),
+        wishes: list[tuple[str, int]] | None = None,
         views: Sequence[View] = (),
     ) -> None:
         self._plan = plan
@@ -99,7 +99,7 @@ class Execution:
             self._domain = run_domain(plan, self._recording_plan)
             stack.callback(self._domain.release)
             self.folder = make_run_folder(plan.request.output, plan.project.name)
-            self._files = write_node_files(plan, self.folder)
+            self._plan, self._files = write_node_files(plan, self.folder)
             self._listener = plan.deployment.control_listener(self.folder) or UnixListener(
                 self.folder
             )
@@ -147,8 +147,6 @@ class Execution:
             stack.callback(reaper.finish)
             for file in self._listener.files:
                 reaper.remove_later(file)
-            if self._plan.is_held:
-                reaper.remove_later(self.folder / SESSION_SOCKET_NAME)
             return self._run(reaper, started)
 
     def _run(self, reaper: Reaper, started: float) -> dict[str, Any]:

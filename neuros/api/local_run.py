@@ -16,15 +16,16 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, ClassVar
 
+from neuros.api.live import why_it_ended
 from neuros.api.plan import Plan
 from neuros.api.run import Run
 from neuros.api.run_folder import make_run_folder, save_record, write_node_files
-from neuros.api.run_record import judge, run_record
+from neuros.api.run_record import judge, run_record, run_table
 from neuros.backends.console import format_record
 from neuros.control import AtRest, Message, NodeStatus, Ready, Shutdown
-from neuros.errors import NeurosError
+from neuros.errors import NeurosError, UsageError
 from neuros.launcher.outcome import EXIT_CODES, Outcome
 from neuros.launcher.quiescence import Declarations
 from neuros.node.context import ContextSwitch
@@ -32,7 +33,8 @@ from neuros.node.failures import callback_error
 from neuros.node.node import NodeRuntime
 from neuros.node.reports import declared
 from neuros.options import recorded_values
-from neuros.project.model import NodeFile
+from neuros.project.model import Node, NodeFile
+from neuros.project.plugin_files import read_plugin
 from neuros.recording.provenance import GitState, provenance
 from neuros.runtime.local import LocalLoop, LocalMiddleware, Record, log_in_python
 from neuros.transport.digests import digest_of
@@ -43,7 +45,6 @@ NAME = "local"
 _DRAIN_S = 5.0
 _REPORT_S = 1.0
 _CELL_S = 0.02
-_FRAMES = 8
 _CHECKS = 100
 _GRACE_S = 1.0
 """How much longer than its time-out a step may take until the hook that runs is interrupted."""
@@ -65,6 +66,8 @@ class LocalRun:
         UsageError: if the run folder cannot be made.
     """
 
+    _nest_user: ClassVar[LocalRun | None] = None
+
     def __init__(self, plan: Plan, messages: Sequence[Path], *, exposes: bool) -> None:
         request, project = plan.request, plan.project
         sys.path[:0] = [path for path in map(str, messages) if path not in sys.path]
@@ -74,7 +77,7 @@ class LocalRun:
         self._run_id = os.urandom(8).hex()
         self._git = GitState(project.folder)
         self.folder = make_run_folder(request.output, project.name)
-        self._files = write_node_files(plan, self.folder)
+        _, self._files = write_node_files(plan, self.folder, keeps_functions=True)
         self._outcome = Outcome()
         self._declarations = Declarations(self._files)
         self._ready: set[str] = set()
@@ -106,8 +109,8 @@ class LocalRun:
             with self._inside():
                 self._load()
                 self._loop.run_until_idle()
-        except BaseException:
-            self.interrupt("the start was interrupted", EXIT_CODES[signal.SIGINT])
+        except BaseException as error:
+            self.interrupt(*why_it_ended(error))
             raise
         if self._failed_or_over():
             self._finish()
@@ -225,9 +228,16 @@ class LocalRun:
         assert self._run is not None
         return self._run
 
+    def last_packets(self, output: str) -> tuple[int, Sequence[Any]]:
+        """The packets of an output that were kept until the end."""
+        node, _, port = output.partition(".")
+        history = self._nodes[node].histories.by_output.get(port) if node in self._nodes else None
+        return (history.count, [*history.packets]) if history is not None else (0, ())
+
     # ------------------------------------------------------------------ inside
 
     def _load(self) -> None:
+        self._claim_nest()
         for file in self._files:
             try:
                 self._add(file)
@@ -239,6 +249,24 @@ class LocalRun:
             node.reports.begin()
         for node in self._nodes.values():
             node.start(awaits_others=True)
+
+    def _claim_nest(self) -> None:
+        """Have NEST begin anew, if nodes of this run use it: its kernel is that of the process.
+
+        Raises:
+            UsageError: if another session of the program uses it now.
+        """
+        if not any(_uses_nest(file.node) for file in self._files):
+            return
+        user = LocalRun._nest_user
+        if user is not None:
+            raise UsageError(
+                f"NEST has one kernel per process, and the session in {user.folder} uses it: close"
+                ' that, or use session(backend="process")'
+            )
+        LocalRun._nest_user = self
+        if "nest" in sys.modules:
+            sys.modules["nest"].ResetKernel()
 
     def _add(self, file: NodeFile) -> None:
         node = self._nodes[file.node.name] = NodeRuntime(
@@ -304,16 +332,20 @@ class LocalRun:
         return self._thread.until(end_s)
 
     def _describe_hang(self, thread: int) -> str:
-        """Where a hook stands that does not return, and the time that is over."""
+        """Where a hook stands that does not return."""
         frame = sys._current_frames().get(thread)
-        stack = "".join(traceback.format_stack(frame)[-_FRAMES:]) if frame else ""
         for node in self._nodes.values():
             hook = node.engine.executing if node.engine is not None else None
-            if hook is not None:
-                text = f"hook '{hook.name}' did not return in time; it stood here:\n{stack}"
+            if hook is not None and frame is not None:
+                stack = traceback.extract_stack(frame)
+                files = [each.filename for each in stack]
+                plugin = str(node.file.node.plugin)
+                own = stack[files.index(plugin) :] if plugin in files else stack
+                lines = "".join(traceback.format_list(own))
+                text = f"hook '{hook.name}' did not return in time; it stood here:\n{lines}"
                 self._write(node.name, Record("ERROR", text))
                 return f"node '{node.name}': {text}"
-        return f"the step did not end in time; it stood here:\n{stack}"
+        return "the step did not end in time"
 
     def _fail_after_hang(self) -> None:
         """A hook was interrupted, or the engine, whose state is unknown then."""
@@ -390,6 +422,8 @@ class LocalRun:
             self._contexts.close()
             self._thread.close()
             atexit.unregister(self._end_with_program)
+            if LocalRun._nest_user is self:
+                LocalRun._nest_user = None
             self._record()
             self._run = Run(self.folder)
         if interruption is not None:
@@ -426,6 +460,8 @@ class LocalRun:
         }
         judge(record, outcome, plan.project.budgets)
         save_record(record, outcome, self.folder, self._run_id)
+        if self._is_shown:
+            sys.stdout.write(f"\n{run_table(record)}\n\n{outcome.reason}\n")
 
     def _end_with_program(self) -> None:
         self.interrupt("the program ended before it closed the session", EXIT_CODES[signal.SIGINT])
@@ -528,6 +564,13 @@ class _Thread:
         if not self._is_inside or self._loop.interruption is not None:
             signal.default_int_handler(number, frame)
         self._loop.interrupt(KeyboardInterrupt())
+
+
+def _uses_nest(node: Node) -> bool:
+    if node.container.partition(":")[0] == "neuros_nest":
+        return True
+    plugin = read_plugin(node.plugin)
+    return plugin is not None and any(n.name.partition(".")[0] == "nest" for n in plugin.needs)
 
 
 def _is_main() -> bool:

@@ -53,7 +53,8 @@ class Run(PastRun):
     @property
     def exit_code(self) -> int:
         """0 normal end; 1 a node failed or was killed, a deadlock, or loss on a lossless
-        connection; 4 a record was not written; 5 a budget was broken; 130 Ctrl+C; 143 SIGTERM.
+        connection; 4 a record was not written; 5 a budget was broken; 7 the program
+        that held it failed; 130 Ctrl+C; 143 SIGTERM.
         """
         return int(self.record["exit_code"])
 

@@ -24,10 +24,16 @@ from typing import Any
 
 import numpy as np
 
-from neuros.api.loading import seed_variables, with_model_fields
+from neuros.api.live import PROGRAM_FAILED, why_it_ended
+from neuros.api.loading import seed_variables, value_text, with_model_fields
 from neuros.api.run import Run
 from neuros.api.run_record import run_table
-from neuros.api.session_link import Held, connections_to, declared_at, port_of
+from neuros.api.session_link import (
+    Held,
+    connections_to,
+    declared_at,
+    port_of,
+)
 from neuros.control import AtRest, NodeStatus
 from neuros.errors import NeurosError, RunError, UsageError
 from neuros.node.instruments import MOST_PACKETS
@@ -39,7 +45,6 @@ _READ_S = 1.0
 _MOST_ROUNDS_AT_REST = 1000
 _FINE = 1e-9
 _MOST_VARIATION = 2.0
-_PROGRAM_FAILED = 1
 
 
 class Session:
@@ -60,13 +65,17 @@ class Session:
         runs: those that a reset has ended; each has a folder of its own.
     """
 
-    def __init__(self, start: Callable[[int | None, Mapping[str, Any]], Held], seed: int | None):
-        self._start = start
+    def __init__(
+        self,
+        prepare: Callable[[int | None, Mapping[str, Any]], Callable[[], Held]],
+        seed: int | None,
+    ) -> None:
+        self._prepare = prepare
         self._seed = seed
         self._lock = threading.RLock()
         self._outputs: dict[str, _Received] = {}
         self.runs: list[Run] = []
-        self._hold(start(seed, {}))
+        self._hold(prepare(seed, {})())
 
     def _hold(self, held: Held) -> None:
         """Take a run that has just been started."""
@@ -79,7 +88,7 @@ class Session:
         try:
             self._take(held.run.begin(self._known))
         except BaseException:
-            held.run.interrupt("the session could not begin", _PROGRAM_FAILED)
+            held.run.interrupt("the session could not begin", PROGRAM_FAILED)
             raise
 
     def _begin_anew(self) -> None:
@@ -189,23 +198,25 @@ class Session:
             seed = self._seed if seed is None else seed
             settings = with_model_fields(self._project, set or {})
             if not self._reset_in_place(seed, settings):
+                start = self._prepare(seed, settings)  # what is wrong ends no run
                 self.runs.append(self.close("the session was reset"))
-                self._hold(self._start(seed, settings))
+                self._hold(start())
             self._seed = seed
 
     def _reset_in_place(self, seed: int | None, settings: Mapping[str, Any]) -> bool:
         """Whether the nodes could be reset in their process."""
         variables = {} if seed is None else seed_variables(self._project, seed)
-        changed: dict[str, dict[str, str]] = {name: {**own} for name, own in variables.items()}
+        names = [node.name for node in self._project.nodes]
         for path, value in settings.items():
             kind, _, rest = path.partition(".")
             node, _, rest = rest.partition(".")
             place, _, variable = rest.partition(".")
-            if kind != "nodes" or place != "environment" or not variable or value is None:
+            is_variable = kind == "nodes" and node in names and place == "environment"
+            if not (is_variable and variable) or value is None:
                 return False
-            changed.setdefault(self._project.node(node).name, {})[variable] = str(value)
+            variables.setdefault(node, {})[variable] = value_text(path, value)
         try:
-            if self._run is not None or not self._held.reset(changed):
+            if self._run is not None or not self._held.reset(variables):
                 return False
         except RunError:
             return False
@@ -220,7 +231,7 @@ class Session:
         node, port = port_of(self._project, output, is_input=False)
         return SessionOutput(self, f"{node.name}.{port.name}", port)
 
-    def probe(self, output: str, *, every: int = 1) -> Probe:
+    def probe(self, output: str, *, every: int = 1) -> PacketProbe:
         """Keep the packets of an output from now on, over resets, too.
 
         Args:
@@ -230,7 +241,7 @@ class Session:
             raise UsageError(f"every={every}: give 1 or more packets")
         found = self[output]
         with self._lock:
-            probe = Probe(found.name, found._port, every)
+            probe = PacketProbe(found.name, found._port, every)
             self._received(found.name)._probes.append((probe, partial(self._copy, found._port)))
         return probe
 
@@ -348,7 +359,7 @@ class Session:
     def _run_sim(self, duration_s: float) -> bool:
         """Grant many rounds at once, but none that is to begin after the end.
 
-        In one process the nodes know the end, too. Elsewhere a round is taken to gain twice as much
+        In one thread the nodes know the end, too. Elsewhere a round is taken to gain twice as much
         as the largest average so far, so a grant covers half of what is left, or less. Where rounds
         suddenly gain several times as much, some may begin after it.
         """
@@ -410,12 +421,14 @@ class Session:
             if received is None:
                 received = self._outputs[output] = _Received()
                 self._known[output] = 0
+                if self._run is not None:
+                    self._take_last(output, received)
                 end_s = None
                 if self._held.is_behind and wait_s is not None:
                     end_s = time.monotonic() + wait_s
                 try:
-                    self._check_running()
-                    self._advance(0, end_s)
+                    if self._run is None:
+                        self._advance(0, end_s)
                 except BaseException:
                     del self._outputs[output], self._known[output]
                     raise
@@ -426,6 +439,14 @@ class Session:
 
     def _end(self) -> None:
         self._run = self._held.wait()
+        for name, received in self._outputs.items():
+            self._take_last(name, received)
+
+    def _take_last(self, name: str, received: _Received) -> None:
+        """Keep the packets that came after the last answer."""
+        count, contents = self._held.last_packets(name)
+        if count > received.count:
+            received.add(count, contents[received.count - count :])
 
     def _check_running(self) -> None:
         if self._run is not None:
@@ -452,7 +473,7 @@ class _Received:
     """
 
     def __init__(self) -> None:
-        self._probes: list[tuple[Probe, Callable[[Any], Any]]] = []
+        self._probes: list[tuple[PacketProbe, Callable[[Any], Any]]] = []
         self.begin_anew()
 
     def begin_anew(self) -> None:
@@ -551,7 +572,7 @@ class SessionOutput:
         return f"<{self.name}: {count} packets of {self._port.type}>"
 
 
-class Probe:
+class PacketProbe:
     """The packets of an output since :meth:`Session.probe`, oldest first.
 
     Attributes:
@@ -565,19 +586,26 @@ class Probe:
         self.packets: list[Any] = []
         self.dropped = 0
         self._type = port.type
+        self._has_fields = port.array is None
         self._every = every
         self._count = 0
 
     def __len__(self) -> int:
         return len(self.packets)
 
-    def array(self, field: str) -> np.ndarray[Any, np.dtype[Any]]:
+    def array(self, field: str = "") -> np.ndarray[Any, np.dtype[Any]]:
         """One field of all packets, ``linear_acceleration.x``: an array, a row per packet.
+
+        Without a field: all packets of a port of arrays.
 
         Raises:
             UsageError: if packets have no such field, or its lengths differ.
         """
+        if not field and not self._has_fields:
+            return np.array(self.packets)
         try:
+            if not (field and self._has_fields):
+                raise AttributeError
             rows = [np.asarray(operator.attrgetter(field)(packet)) for packet in self.packets]
         except AttributeError:
             raise UsageError(f"{self.name}: {self._type} has no field '{field}'") from None
@@ -593,7 +621,7 @@ class Probe:
             self._count += 1
 
     def __repr__(self) -> str:
-        return f"<Probe of {self.name}: {len(self)} packets of {self._type}>"
+        return f"<PacketProbe of {self.name}: {len(self)} packets of {self._type}>"
 
 
 def check_length(
@@ -632,10 +660,3 @@ def check_seconds(**named: Any) -> float:
     except (TypeError, ValueError):
         pass
     raise UsageError(f"{name}={seconds!r}: give 0 or more seconds")
-
-
-def why_it_ended(error: BaseException) -> tuple[str, int]:
-    """The reason and the exit code of a run whose program fails."""
-    if isinstance(error, KeyboardInterrupt):
-        return "ended by Ctrl+C", 130
-    return f"the program failed: {type(error).__name__}: {error}", _PROGRAM_FAILED

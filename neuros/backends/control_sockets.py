@@ -17,8 +17,6 @@ from neuros.errors import EnvironmentFault
 from neuros.ports import ControlStream
 
 SOCKET_NAME = "control.sock"
-SESSION_SOCKET_NAME = "session.sock"
-"""Where a process that holds all nodes of a run listens to its session."""
 _GROUP = "neuros.control"
 _SCHEME = "unix"
 _MOST_WAITING = 256
@@ -27,8 +25,8 @@ _MOST_WAITING = 256
 class UnixListener:
     """Listens at a Unix socket in the run folder (:class:`neuros.ports.ControlListener`)."""
 
-    def __init__(self, run_folder: Path, name: str = SOCKET_NAME) -> None:
-        self._path = run_folder / name
+    def __init__(self, run_folder: Path) -> None:
+        self._path = run_folder / SOCKET_NAME
         self.address = f"{_SCHEME}:{self._path}"
         self.files = (self._path,)
 
@@ -75,7 +73,14 @@ def connect(address: str) -> ControlStream:
     """
     scheme, _, place = address.partition(":")
     if scheme == _SCHEME:
-        return connect_unix(Path(place))
+        connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            with _short_path(Path(place)) as name:
+                connected.connect(name)
+        except OSError:
+            connected.close()
+            raise
+        return connected
     from importlib.metadata import entry_points
 
     found = {each.name: each for each in entry_points(group=_GROUP)}
@@ -98,18 +103,6 @@ def connect_by(environ: Mapping[str, str]) -> ControlStream:
             " starts it, and sets the variable"
         )
     return connect(address)
-
-
-def connect_unix(path: Path) -> socket.socket:
-    """Connect to a Unix socket, however long its path is. Raises ``OSError``."""
-    connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        with _short_path(path) as name:
-            connected.connect(name)
-    except OSError:
-        connected.close()
-        raise
-    return connected
 
 
 @contextlib.contextmanager

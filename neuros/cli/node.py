@@ -12,8 +12,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-from neuros.backends.control_sockets import SESSION_SOCKET_NAME, UnixListener, connect_by
-from neuros.errors import EnvironmentFault
+from neuros.backends.control_sockets import connect_by
 from neuros.node.process import NodeProcess
 from neuros.ports import Middleware, PacketRecorder
 from neuros.project.model import NodeFile
@@ -68,13 +67,6 @@ def _run_node(options: argparse.Namespace) -> int:
         return middleware
 
     run_folder = files[0].folders.run
-    listener = None
-    if options.held and options.one_process:
-        listener = UnixListener(run_folder, SESSION_SOCKET_NAME)
-        try:
-            listener.open()
-        except EnvironmentFault:  # the session steps through the supervisor, only slower
-            listener = None
     open_recorder = None
     if options.record:
         from neuros.recording import spool
@@ -92,6 +84,5 @@ def _run_node(options: argparse.Namespace) -> int:
         open_recorder=open_recorder,
         duration_sim_s=options.duration_sim,
         is_held=options.held,
-        session=listener,
         own_logs=options.one_process,
     ).run()

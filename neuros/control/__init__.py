@@ -2,8 +2,8 @@
 
 It is not part of the data path: nodes report once per second, on a change of state and at the end;
 the supervisor answers rarely. Observers (the dashboard) get no more than they ask for. Every
-message is a class of this module; :data:`FROM_NODES`, :data:`TO_NODES`, :data:`FROM_OBSERVERS`,
-:data:`TO_OBSERVERS`, :data:`FROM_SESSION` and :data:`TO_SESSION` say who sends which.
+message is a class of this module; :data:`FROM_NODES`, :data:`TO_NODES`, :data:`FROM_OBSERVERS` and
+:data:`TO_OBSERVERS` say who sends which.
 
 A message travels as MessagePack, behind its length: a map with its fields and ``kind``, the name of
 its class in snake_case. The bytes go through any :class:`neuros.ports.ControlStream`; the back end
@@ -306,6 +306,10 @@ class Activate(Message):
     """Start tick and function hooks: every node of the project is ready."""
 
 
+class StopHooks(Message):
+    """Start no further hook, and go on to receive."""
+
+
 class Stop(Message):
     """Start no further hook, finalise and end."""
 
@@ -343,21 +347,16 @@ class Look(Message):
 
 
 class Advance(Message):
-    """While paused, take packets and run steps; answer `at_rest` once nothing moves, and pause.
+    """While paused, run steps; answer `at_rest` once nothing moves, and pause.
 
     Attributes:
         rounds: so many steps.
         known: outputs whose packets are asked for, and the number of the newest known packet.
-        packets: node, input and content of each packet of the session.
-        end_sim_s: a simulated time at which no further step begins; each step waits for the one
-            before then.
     """
 
     number: int
     rounds: int
     known: Mapping[str, int]
-    packets: tuple[tuple[str, str, bytes], ...] = ()
-    end_sim_s: float | None = None
 
 
 class Reset(Message):
@@ -443,11 +442,23 @@ FROM_NODES: Sequence[type[Message]] = (
     *(Explanation, Heard, NodeStatus, AtRest, WasReset),
 )
 TO_NODES: Sequence[type[Message]] = (
-    *(Begin, Activate, Probe, Explain, Drain, Stop, Say, Leave, Pause, Resume, Step, Look),
+    *(
+        Begin,
+        Activate,
+        Probe,
+        Explain,
+        Drain,
+        StopHooks,
+        Stop,
+        Say,
+        Leave,
+        Pause,
+        Resume,
+        Step,
+        Look,
+    ),
     *(Advance, Deliver, Reset),
 )
-FROM_SESSION: Sequence[type[Message]] = (Advance,)
-TO_SESSION: Sequence[type[Message]] = (AtRest,)
 FROM_OBSERVERS: Sequence[type[Message]] = (
     *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Advance, Deliver, Reset),
 )

@@ -48,7 +48,8 @@ class Outcome:
 
     Attributes:
         exit_code: 0 ended normally, 1 a node failed or deadlock, 4 the engine went away or what
-            should have been recorded could not be, 5 a budget was broken, 130 and 143 by signal.
+            should have been recorded could not be, 5 a budget was broken, 7 the program that had
+            started it failed, 130 and 143 by signal.
         reason: one line for the user.
         reports: the last report of every node that made one.
         report_times_s: when that was, on the monotonic clock.
@@ -136,6 +137,10 @@ class Outcome:
                 self.faults.append(report.fault)
             self.timelines.setdefault(name, []).extend(report.timeline)
             self.report_times_s[name] = now_s
+
+    def excuse(self, still_s: float) -> None:
+        """The launcher stood still for so long, and perhaps the nodes: their reports are as new."""
+        self.report_times_s = {n: at_s + still_s for n, at_s in self.report_times_s.items()}
 
     def begin_to_end(self, now_s: float) -> None:
         """The end has been asked for; the first time counts."""

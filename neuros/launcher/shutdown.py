@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from neuros.control import Drain, Leave, Stop
+from neuros.control import Drain, Leave, Stop, StopHooks
 from neuros.launcher.channels import Channels
 from neuros.launcher.finalising import LEAVE_S, Finalising
 from neuros.launcher.outcome import (
@@ -52,6 +52,9 @@ class Shutdown:
     Args:
         _signals: numbers of the signals that have arrived, appended to by a signal handler.
         _on_stop: called once nodes have been told to end.
+        _may_wake: whether packets that nobody counts may have a hook start in a drained run: of
+            connections that may lose some, and of external topics. What such a hook sent to a node
+            that has stopped would be lost, so all hooks stop before any node does.
 
     Attributes:
         is_hopeless: whether something outlasts even SIGKILL; the reaper will try on for a while.
@@ -70,6 +73,7 @@ class Shutdown:
     _output: SupervisorOutput
     _signals: list[int]
     _on_stop: Callable[[], object]
+    _may_wake: bool = False
     phase: Phase = Phase.RUNNING
     _deadline_s: float = 0.0
     _asked: tuple[str, float, str] | None = None  # a drained end, while the run starts
@@ -81,6 +85,7 @@ class Shutdown:
         """The run stood still for so long: what nodes have for their end begins where it was."""
         self._deadline_s += still_s
         self._finalising.excuse(still_s)
+        self._outcome.excuse(still_s)
 
     def drain(self, reason: str, drain_s: float, stopped: str = "") -> None:
         """Let packets under way arrive, and then end; only a run that is not ending already.
@@ -200,6 +205,11 @@ class Shutdown:
             self._look_at_stopping(now_s)
         elif self.phase is Phase.DRAINING:
             if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
+                if self._may_wake:
+                    self._may_wake = False
+                    self._channels.send(StopHooks())
+                    self._probing.drain(self._processes.killed, now_s)
+                    return
                 self._outcome.has_drained = True
                 self._stop()
             elif now_s >= self._deadline_s:

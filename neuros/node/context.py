@@ -82,6 +82,8 @@ class ContextSwitch:
         plugin: Path | None,
         project: Path,
         log_file: Path | None = None,
+        *,
+        shares_modules: bool = False,
     ) -> Context:
         """The context for a node.
 
@@ -91,18 +93,23 @@ class ContextSwitch:
                 of an installed package, which is found as it is.
             project: modules from below this folder are private to the node.
             log_file: where its standard output and error go, ``None`` to leave them.
+            shares_modules: whether the plugin is functions of the program: no module of that is
+                hidden from them.
         """
         log_fd = None
         if log_file is not None:
             log_file.parent.mkdir(parents=True, exist_ok=True)
             log_fd = os.open(log_file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        return Context(
+        context = Context(
             environment,
             self._environ_with(environment),
             [*([str(plugin.parent)] if plugin else []), *self._process.path],
             str(project) + os.sep,
             log_fd,
         )
+        if shares_modules:
+            context.modules = self._process.modules
+        return context
 
     def enter(self, context: Context) -> None:
         """Put ``context`` in place."""

@@ -36,7 +36,7 @@ class PluginServices:
         is_active: set at time 0 of the run, when every node of the project is ready.
         is_ending: whether no further hook starts.
         results: what the plugin has noted.
-        make_packet: a new message with default values, for a type in ROS notation.
+        make_packet: a new packet, for the type of a port.
         time: that of the node, if it has one.
         waiting_threads: those that wait until packets that they have offered are sent.
     """
@@ -170,7 +170,7 @@ class NodeHandle:
         return self._services.time.stamp()
 
     def make_packet(self, output: str | None = None) -> Any:
-        """A new message of the type of an output, with default values.
+        """A new message for an output, with default values, or an array of zeros.
 
         Args:
             output: its name; ``None`` where only one type can be meant: all outputs have it, or

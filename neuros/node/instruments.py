@@ -73,6 +73,16 @@ class PacketHistory:
             maxlen=max(1, min(MOST_PACKETS, _MOST_BYTES // max(1, size)))
         )
 
+    def newest(self, most_bytes: int) -> list[bytes]:
+        """The newest packets that have so many bytes together; the last one in any case."""
+        found: list[bytes] = []
+        for content in reversed(self.packets):
+            most_bytes -= len(content)
+            if found and most_bytes < 0:
+                break
+            found.append(content)
+        return found[::-1]
+
     def since(self, number: int) -> list[Any]:
         """The packets after the one of this number (from 1) that are still there."""
         missing = self.count - number

@@ -5,18 +5,20 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from neuros.control import Finalising, Message, Progress, Ready, Shutdown
+from neuros.control import AtRest, Finalising, Message, Progress, Ready, Shutdown
+from neuros.control.link import to_bytes
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
 from neuros.errors import ControlError, HookError, NeurosError, ProtocolError
-from neuros.hooks import HookKind, HookSpec
+from neuros.hooks import HookKind, HookSpec, hook_specs_of
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices, Results
@@ -28,6 +30,10 @@ from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
 from neuros.ports import Middleware, PacketRecorder, Transport, Way
 from neuros.project.model import Connection, NodeFile, Port
+
+LAST_PACKETS = "last_packets"
+"""In the folder of a node of a session: its newest packets, when the run has ended."""
+_MOST_SAVED_BYTES = 1_000_000
 
 
 class NodeRuntime:
@@ -86,8 +92,11 @@ class NodeRuntime:
         self._tell = tell
         self._contexts = contexts
         environment = self._environment({})
-        plugin = None if file.node.module else file.node.plugin
-        self._context = contexts.make_context(environment, plugin, file.folders.project, log_file)
+        are_functions = bool(file.node.hooks)
+        plugin = None if file.node.module or are_functions else file.node.plugin
+        self._context = contexts.make_context(
+            *(environment, plugin, file.folders.project, log_file), shares_modules=are_functions
+        )
         self._enter = partial(contexts.enter, self._context)
         self._enter()
         self._transport = middleware.transport(file)
@@ -115,7 +124,7 @@ class NodeRuntime:
                 recorder, middleware.packets.encode, lambda: self._time.now_s, self._logger
             )
             instruments.append(self._recorder)
-        self._is_held = is_held
+        self._is_held, self._is_local = is_held, is_local
         packets = middleware.packets
         copy_of = (lambda port: packets.copier(port.type)) if is_local else None
         self.histories = PacketHistories(packets.encode, copy_of)
@@ -210,7 +219,8 @@ class NodeRuntime:
             return "packets are recorded"
         if self._resets:
             return ""
-        if node.module or not node.plugin.is_relative_to(self.file.folders.project):
+        is_own = node.hooks or node.plugin.is_relative_to(self.file.folders.project)
+        if node.module or not is_own:
             return f"the plugin of {self.name} is not in the project's folder"
         if self._middleware.has_foreign_entities(self.file):
             return f"the plugin of {self.name} has made ROS entities"
@@ -234,7 +244,8 @@ class NodeRuntime:
             self._services.close()
             self.handle.set_user_data(None)
         environment = self._environment(variables)
-        self._contexts.renew(self._context, environment, forgets_modules=not is_kept)
+        forgets = not is_kept and not self.file.node.hooks
+        self._contexts.renew(self._context, environment, forgets_modules=forgets)
         self._enter()
         self._time.begin_anew(keeps_owner=is_kept)
         self._services.results.clear()
@@ -283,6 +294,8 @@ class NodeRuntime:
         if runs_hooks and self.engine is not None:
             self._finalise_hooks(lambda name: self._tell(Finalising(self.name, name)))
         self._tell(Finalising(self.name, ""))
+        if self._is_held and not self._is_local:
+            self._save_packets()
         if self._recorder is not None:
             self._recorder.close()
         self._services.close()
@@ -309,27 +322,21 @@ class NodeRuntime:
         self._guard(lambda: self._loaded.on_packet(port.name, packet))
 
     def deliver(self, input_name: str, data: bytes) -> None:
-        """A session sends a packet to one of its inputs.
-
-        Raises:
-            ControlError: if it is none of them.
-            ProtocolError: if the bytes are no message of its type.
-        """
-        port = next((p for p in self.file.node.inputs if p.name == input_name), None)
-        if port is None or port.external_topic is None:
-            raise ControlError(f"a packet came for '{self.name}.{input_name}', no session's input")
-        self.on_external_packet(port, self._middleware.packets.decode(port.type, data))
-
-    def deliver_if_right(self, input_name: str, data: bytes) -> None:
         """An observer sends a packet to an input of the session.
 
         What is none is refused in the log: an observer ends no run by a mistake.
         """
         try:
-            self.deliver(input_name, data)
+            port = next((p for p in self.file.node.inputs if p.name == input_name), None)
+            if port is None or port.external_topic is None:
+                text = f"a packet came for '{self.name}.{input_name}', no session's input"
+                raise ControlError(text)
+            packet = self._middleware.packets.decode(port.type, data)
         except (ControlError, ProtocolError, ValueError) as error:
             self._enter()  # the log is that of its own
             self._logger.warning(f"a packet for input '{input_name}' is refused: {error}")
+        else:
+            self.on_external_packet(port, packet)
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """The receiver of a connection has started on packets."""
@@ -357,10 +364,11 @@ class NodeRuntime:
     def _load_plugin(self) -> None:
         node = self.file.node
         for port in (*node.inputs, *node.outputs):  # the plugin may make messages when imported
-            self._middleware.packets.message_class(port.type)
-        self.specs = self._plugin = with_clocks(
-            node, load_plugin(node.plugin, self.name, node.module)
-        )
+            self._middleware.packets.packet_class(port.type)
+        specs: Sequence[HookSpec] = hook_specs_of(dict(enumerate(node.hooks)))
+        if not node.hooks:
+            specs = load_plugin(node.plugin, self.name, node.module)
+        self.specs = self._plugin = with_clocks(node, specs)
 
     def _make(self) -> Engine:
         """The engine for the hooks of now."""
@@ -374,6 +382,15 @@ class NodeRuntime:
         self._time.clock = self.engine.sim_clock
         return self.engine
 
+    def _save_packets(self) -> None:
+        """Leave the newest packets for a session, which may want to see what led to the end."""
+        packets = {
+            f"{self.name}.{output}": (history.count, history.newest(_MOST_SAVED_BYTES))
+            for output, history in self.histories.by_output.items()
+        }
+        with suppress(OSError):  # a full disk is reported by what loses more by it
+            (self.run_dir / LAST_PACKETS).write_bytes(to_bytes(AtRest(0, {}, packets)))
+
     def _finalise_hooks(self, begin: Callable[[str], object] = lambda _: None) -> None:
         for spec in self.specs:
             if spec.kind is HookKind.FINALISE:
@@ -386,10 +403,10 @@ class NodeRuntime:
 
     def _packet_type(self, port: Port) -> PacketType:
         packets = self._middleware.packets
-        kind = packets.message_class(port.type)
         own = [c for c in self.file.connections if c.source_node == self.file.node.name]
         for_jpeg = any(c.is_jpeg for c in own if c.source_output == port.name)
-        return PacketType(kind, packets.checker(kind, for_jpeg=for_jpeg))
+        check = packets.checker(port.type, for_jpeg=for_jpeg)
+        return PacketType(packets.packet_class(port.type), check)
 
     @property
     def _loaded(self) -> Engine:

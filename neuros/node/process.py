@@ -27,8 +27,7 @@ from neuros.node.node import NodeRuntime
 from neuros.node.peer_link import PeerLink
 from neuros.node.reports import declared
 from neuros.node.saving import Saving
-from neuros.node.stepping import SessionSteps
-from neuros.ports import ControlListener, ControlStream, Middleware, PacketRecorder
+from neuros.ports import ControlStream, Middleware, PacketRecorder
 from neuros.project.model import Connection, NodeFile
 from neuros.stacks import allow_reading
 
@@ -48,7 +47,6 @@ class NodeProcess:
         open_recorder: where a node puts what is recorded; ``None``: nothing is.
         duration_sim_s: simulated time after which the node that owns it ends the project.
         is_held: whether nodes stand still from the start, for a session.
-        session: listens where that connects to step them, if they are all nodes of the run.
         own_logs: whether each node writes to a log file of its own (several nodes share the
             process), rather than to the output that the process was started with.
     """
@@ -62,7 +60,6 @@ class NodeProcess:
         open_recorder: Callable[[NodeFile], PacketRecorder] | None = None,
         duration_sim_s: float | None = None,
         is_held: bool = False,
-        session: ControlListener | None = None,
         own_logs: bool = False,
     ) -> None:
         self._files = files
@@ -71,7 +68,6 @@ class NodeProcess:
         self._open_recorder = open_recorder
         self._duration_sim_s = duration_sim_s
         self._is_held = is_held
-        self._steps = None if session is None else SessionSteps(session, self._advance, self.post)
         self._own_logs = own_logs
         self._contexts = ContextSwitch()
         self._nodes: list[NodeRuntime] = []
@@ -81,12 +77,10 @@ class NodeProcess:
         self._early_lock = threading.Lock()
         self._has_failed = False
         self._asked: Advance | None = None
-        self._is_paused = False
-        self._step: Advance | None = None
         self._is_settling = False
         self._has_begun = self._is_active = False
         self._saving: tuple[str, Saving] | None = None  # of the node that finalises
-        self._is_draining = self._has_been_reset = False
+        self._has_been_reset = False
         self._stop_asked, self._may_begin = threading.Event(), threading.Event()
         self._tell_lock = threading.Lock()
         self._link: ControlLink | None = None
@@ -106,7 +100,7 @@ class NodeProcess:
         plugins = {file.node.name: str(file.node.plugin) for file in self._files}
         self._tell(control.Hello(tuple(plugins), plugins))
         with signals_as_socket() as (signalled, waker):
-            thread = ControlThread(self._link, signalled, self, self._steps)
+            thread = ControlThread(self._link, signalled, self)
             thread.start()
             self._guard(self._live)
             self.report()  # hooks are over: what peers want to know is known before a long end
@@ -132,6 +126,9 @@ class NodeProcess:
                 self.post(self._activate)
             case control.Stop():
                 self.ask_to_stop()
+            case control.StopHooks():
+                for node in tuple(self._nodes):
+                    node.stop()
             case control.Leave():
                 self._peers.leave()
             case control.Say(text):
@@ -157,12 +154,8 @@ class NodeProcess:
         if isinstance(message, control.Reset):
             self._reset(message.variables)
             return
-        self._is_draining = self._is_draining or isinstance(message, control.Drain)
-        if isinstance(message, control.Pause):
-            self._is_paused = True
-        elif isinstance(message, control.Resume):
-            self._is_paused = False
-            self._give_up_settling()
+        if isinstance(message, control.Resume):
+            self._asked = None  # where the run goes freely, an answer would hold it again
         for node in self._nodes:
             match message:
                 case control.Drain(last_round):
@@ -174,7 +167,7 @@ class NodeProcess:
                 case control.Step(count, is_driven):
                     node.step(count, is_driven=is_driven)
                 case control.Deliver(name, input_name, data) if name == node.name:
-                    node.deliver_if_right(input_name, data)
+                    node.deliver(input_name, data)
 
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""
@@ -197,8 +190,6 @@ class NodeProcess:
                 self._early_events.append(event)
                 return
         self._middleware.loop.post_from_thread(event)
-        if self._steps is not None:
-            self._steps.wake()
 
     def report(self) -> None:
         """Report state and counters of all nodes. Any thread."""
@@ -225,83 +216,27 @@ class NodeProcess:
                 node.reports.probe(number, is_idle=is_idle, has_free_threads=has_free_threads)
             )
 
-    def _advance(self, step: Message) -> None:
-        """Do a step of the session, if the run is not at its end."""
-        assert isinstance(step, Advance)
-        for name, input_name, content in step.packets:
-            if name not in self._by_name:
-                raise ControlError(f"a packet came for '{name}.{input_name}', no session's input")
-            self._by_name[name].deliver(input_name, content)
-        if self._is_paused:
-            self._begin_rounds(step)
-            self._begin_settling()
-        else:  # given up, and the run was let go on before it arrived here
-            self._step = step
-            self._give_up_settling()
-
-    def _begin_rounds(self, step: Advance) -> None:
-        """Begin those of a step, or the next one where it ends at a time."""
-        count = step.rounds if step.end_sim_s is None else min(step.rounds, 1)
-        self._step = step
-        step.rounds -= count
-        if count:
-            engines = [node.engine for node in self._nodes if node.engine is not None]
-            is_driven = any(engine.is_driving for engine in engines)
-            for node in self._nodes:
-                node.step(count, is_driven=is_driven)
-
-    def _goes_on(self, step: Advance) -> bool:
-        """Whether further rounds of a step are to begin."""
-        if not step.rounds or step.end_sim_s is None:
-            return False
-        times = (node.sim_time for node in self._nodes)
-        return max((s for s in times if s is not None), default=0.0) < step.end_sim_s
-
     def _begin_settling(self) -> None:
         if not self._is_settling:
             self._is_settling = True
             self._settle()
 
-    def _give_up_settling(self) -> None:
-        """The run goes on freely: where it came to rest, an answer would hold it again."""
-        step, self._asked, self._step = self._step, None, None
-        if step is not None:
-            assert self._steps is not None
-            self._steps.answer(_at_rest(self._nodes, step))
-            self._steps.watch()
-
     def _settle(self) -> None:
         """Answer once no event waits: a hook that may start has a loop-back waiting.
 
-        This is one event for the supervisor and the session, else each would wait for the other.
-        Of several questions of the supervisor the last one counts.
+        Of several questions the last one counts. Where the run is let go on, none is answered.
         """
         assert self._middleware is not None
         loop = self._middleware.loop
-        asked, step = self._asked, self._step
-        self._is_settling = asked is not None or step is not None
-        if self._is_settling and (loop.has_waiting_events or not loop.has_taken_in):
+        asked = self._asked
+        self._is_settling = asked is not None
+        if asked is None or self.is_ending:
+            return
+        if loop.has_waiting_events or not loop.has_taken_in:
             loop.post_loop_back(self._settle)
             return
-        is_over = self._is_draining or self.is_ending  # then the supervisor tells of the end
-        if step is not None and not is_over:
-            for node in self._nodes:
-                node.pause()  # takes back what hooks could not use of a round
-            if self._goes_on(step):
-                self._begin_rounds(step)
-                loop.post_loop_back(self._settle)
-                return
-        self._asked = self._step = None
-        self._is_settling = False
-        if step is not None and not is_over:
-            assert self._steps is not None
-            self._steps.answer(_at_rest(self._nodes, step))
-            if asked is None:
-                loop.post_loop_back(self._steps.take)
-            else:
-                self._steps.watch()  # what the supervisor says next comes before the next step
-        if asked is not None and not self.is_ending:
-            self._tell(_with_counters(_at_rest(self._nodes, asked), self._nodes))
+        self._asked, self._is_settling = None, False
+        self._tell(_with_counters(_at_rest(self._nodes, asked), self._nodes))
 
     def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:
         """Bring all nodes back to their start, once no event waits, if they can be."""
@@ -444,7 +379,6 @@ class NodeProcess:
 
     def _tell(self, message: Message) -> None:
         assert self._link is not None
-        self._is_draining = self._is_draining or isinstance(message, control.Shutdown)
         with self._tell_lock:
             self._link.send(message)
 
@@ -484,13 +418,11 @@ class ControlThread(threading.Thread):
         link: ControlLink,
         signalled: socket.socket,
         process: NodeProcess,
-        steps: SessionSteps | None = None,
     ) -> None:
         super().__init__(name="neuros-control", daemon=True)
         self._link = link
         self._signalled = signalled
         self._process = process
-        self._steps = steps
         self._ended = threading.Event()
         # Here: once the thread comes to it, a node that fails at once may have closed them.
         self._selector = selectors.DefaultSelector()
@@ -500,19 +432,12 @@ class ControlThread(threading.Thread):
     def run(self) -> None:
         """Until the supervisor hangs up or :meth:`end`."""
         next_report_s = time.monotonic() + _REPORT_S
-        with self._selector as selector, contextlib.ExitStack() as stack:
-            if self._steps is not None:
-                stack.callback(self._steps.close)
-                self._steps.listen(selector)
+        with self._selector as selector:
             while not self._ended.is_set():
                 ready = selector.select(max(0.0, next_report_s - time.monotonic()))
-                # What the supervisor has said comes before what the session has said since.
-                ready.sort(key=lambda pair: pair[0].fileobj is not self._link)
                 for key, _ in ready:
                     if not key.data():
                         return
-                if self._steps is not None and self._process.is_ending:
-                    self._steps.shut()
                 if time.monotonic() >= next_report_s and not self._ended.is_set():
                     next_report_s = time.monotonic() + _REPORT_S
                     self._try(self._process.report)

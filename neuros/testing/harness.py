@@ -30,9 +30,11 @@ from neuros.node.context import ContextSwitch
 from neuros.node.handle import NodeHandle
 from neuros.node.node import NodeRuntime
 from neuros.node.plugin import no_module
+from neuros.project.in_python import Plugin, functions_of, plugin_key
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.project.paths import find_module, is_module_name
+from neuros.project.plugin_files import file_of
 from neuros.runtime.local import Record
 from neuros.testing.stand_ins import (
     ManualClock,
@@ -44,7 +46,7 @@ from neuros.testing.stand_ins import (
     with_observer,
 )
 from neuros.transport.memory import MemoryHub
-from neuros.transport.messages import checked, copy_packet, message_class
+from neuros.transport.messages import checked, copy_packet, make_packet
 
 _MANY = 10_000
 """Hook executions after which :meth:`PluginHarness.run` assumes that they never end."""
@@ -174,7 +176,8 @@ class PluginHarness:
         shutdown_reason: the argument of the plugin's ``node.shutdown``, ``None`` before.
 
     Args:
-        plugin: the plugin file, or the name of an installed module.
+        plugin: the plugin file, the name of an installed module, or functions with a decorator of
+            :mod:`neuros.hooks`, one or a list; they run as they are, in this program.
         inputs, outputs: message type by name of the port.
         connections: those that differ, ``wire("camera.image -> node.view", discard_limit=3)``.
         environment: environment variables of the node.
@@ -184,11 +187,12 @@ class PluginHarness:
     Raises:
         PluginError, HookError: if the plugin cannot be imported, or declares its hooks wrongly.
         ValueError: if a connection does not fit the ports.
+        UsageError: if a function has no such decorator.
     """
 
     def __init__(
         self,
-        plugin: str | os.PathLike[str],
+        plugin: Plugin,
         *,
         inputs: Mapping[str, str] | None = None,
         outputs: Mapping[str, str] | None = None,
@@ -197,12 +201,17 @@ class PluginHarness:
         name: str = "node",
         run_folder: Path | None = None,
     ) -> None:
-        path, module = Path(plugin).resolve(), ""
-        if not path.exists() and is_module_name(os.fspath(plugin)):
-            module = os.fspath(plugin)
-            if (found := find_module(module)) is None:
-                raise no_module(module)
-            path = found
+        hooks, module = functions_of(plugin), ""
+        if hooks:
+            path = file_of(hooks)
+        else:
+            written = plugin_key(plugin) or ""
+            path = Path(written).resolve()
+            if not path.exists() and is_module_name(written):
+                module = written
+                if (found := find_module(module)) is None:
+                    raise no_module(module)
+                path = found
         node = Node(
             name=name,
             container="neuros_python",
@@ -212,9 +221,11 @@ class PluginHarness:
             environment=dict(environment or {}),
             file=path,
             module=module,
+            hooks=hooks,
         )
         wires = with_neighbours(node, connections)
-        self._open(node, wires, path.parent, WORKSPACE, run_folder)
+        project = path.parent if path.exists() else Path.cwd()
+        self._open(node, wires, project, WORKSPACE, run_folder)
 
     @classmethod
     def from_project(
@@ -425,8 +436,8 @@ class PluginHarness:
     # ------------------------------------------------------------------ what goes in
 
     def make_packet(self, port: str) -> Any:
-        """A new message of the type of an input (or else an output), with default values."""
-        return message_class(self._port(port, "port", self._inputs | self._outputs).type)()
+        """A new packet for an input (or else an output): default values, an array of zeros."""
+        return make_packet(self._port(port, "port", self._inputs | self._outputs).type)
 
     def send(self, input_name: str, *packets: Any, source: str | None = None) -> None:
         """Send packets to an input; packets that its connection does not let through yet wait.

@@ -53,6 +53,7 @@ __all__ = [
     "VisualiseRing",
     "VisualiseRotations",
     "VisualiseSpikes",
+    "image_pixels",
 ]
 
 _LARGEST_SIDE = 320
@@ -388,7 +389,7 @@ class VisualiseImages(_Figure):
             ValueError: for another encoding or shape.
         """
         self._check(name)
-        pixels = _pixels(image)
+        pixels = image_pixels(image)
         step = max(1, math.ceil(max(pixels.shape[:2]) / _LARGEST_SIDE))
         small = np.ascontiguousarray(pixels[::step, ::step])
         message = ("data", self._number, name, timestamp, small)
@@ -449,10 +450,14 @@ def _file_for(title: str) -> Path:
     return next(file for name in names if (file := folder / f"{name}.png") not in taken)
 
 
-def _pixels(image: Any) -> Any:
+def image_pixels(image: Any) -> Any:
     """The pixels of a ``sensor_msgs/msg/Image`` or array, red first.
 
-    Raises ``ValueError`` for an encoding or shape that cannot be drawn.
+    Returns:
+        An array ``(height, width)`` or ``(height, width, 3)``; it may share the message's memory.
+
+    Raises:
+        ValueError: for an encoding or shape that cannot be drawn.
     """
     encoding = getattr(image, "encoding", None)
     if encoding is None:

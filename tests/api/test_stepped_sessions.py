@@ -35,21 +35,13 @@ from neuros.cli.main import main
 from neuros.control import (
     TO_OBSERVERS,
     Advance,
-    AtRest,
     Deliver,
     LogRecord,
-    Message,
-    Resume,
     Watch,
 )
 from neuros.control.link import ControlLink
 from neuros.errors import ProjectError, RunError, UsageError
-from neuros.launcher.supervisor import Supervisor
 
-# The input that a test pushes the robot by.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*'(push|clock|wind)' of node '(robot|left)' is not connected"
-)
 ACCEPTANCE = pytest.mark.acceptance
 EVERY_BACK_END = [
     "local",
@@ -327,37 +319,6 @@ def test_what_is_stepped_to_its_end_is_verified_against_a_free_run(
     assert "identical" in capsys.readouterr().out
 
 
-def test_a_step_goes_straight_to_the_process_that_holds_all_nodes(
-    held: Session, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    heard: list[object] = []
-    take = Supervisor._take
-
-    def overhear(self: Supervisor, link: ControlLink, message: Message) -> None:
-        heard.append(type(message))
-        take(self, link, message)
-
-    monkeypatch.setattr(Supervisor, "_take", overhear)
-    before = held["robot.pose"].count
-    held.send("robot.push", Float64(data=1.0))
-    held.step(3, timeout_s=DEADLINE_S)
-    assert held["robot.pose"].count == before + 3
-    assert not {Advance, AtRest, Deliver}.intersection(heard)
-
-
-def test_a_step_goes_by_the_supervisor_where_the_nodes_are_out_of_reach(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(path: Path) -> None:
-        raise ConnectionRefusedError(path)
-
-    monkeypatch.setattr("neuros.api.session_link.connect_unix", refuse)
-    with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
-        assert poses(s, 3) == [1.0, 0.5, 0.25]
-        s.send("robot.push", Float64(data=8.0))
-        assert poses(s, 1) == [8.125]
-
-
 def observer_of(live: LiveRun) -> ControlLink:
     """An observer, as soon as the run can be observed."""
     deadline_s = time.monotonic() + DEADLINE_S
@@ -409,6 +370,7 @@ def test_a_wrong_packet_of_an_observer_is_refused_and_the_session_goes_on(
     assert "Traceback" not in log.read_text("utf-8")
 
 
+@pytest.mark.filterwarnings("ignore:.*'(push|clock)' of node 'robot' is not connected")
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_in_a_run_that_is_no_session_every_packet_of_an_observer_is_refused(
     tmp_path: Path, back_end: str
@@ -421,15 +383,6 @@ def test_in_a_run_that_is_no_session_every_packet_of_an_observer_is_refused(
     assert all(f"a packet came for 'robot.{name}', no session's input" in told for name in names)
     live.stop("enough")
     assert live.wait(DEADLINE_S).exit_code == 0
-
-
-def test_a_step_with_a_packet_for_no_node_fails_the_run_in_a_sentence(tmp_path: Path) -> None:
-    with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
-        s._held._link.deliver("nobody", "push", b"")
-        s._held._link.advance(1, {"nobody.pose": 0}, time.monotonic() + DEADLINE_S)
-        run = s._held._live.wait(DEADLINE_S)
-    assert run.exit_code == 1
-    assert "a packet came for 'nobody.push', no session's input" in run.reason
 
 
 def test_what_is_sent_before_a_free_run_arrives_before_it(tmp_path: Path) -> None:
@@ -479,7 +432,6 @@ def test_a_free_run_ends_where_simulated_time_is_over(held: Session) -> None:
     assert held.sim_time == pytest.approx(end_s)
 
 
-@pytest.mark.filterwarnings("ignore:.*'clock' of node 'eye' is not connected")
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_a_free_run_ends_on_time_where_rounds_gain_different_times(
     tmp_path: Path, back_end: str
@@ -493,9 +445,8 @@ def test_a_free_run_ends_on_time_where_rounds_gain_different_times(
             assert s.sim_time == pytest.approx(end_s)
 
 
-@pytest.mark.filterwarnings("ignore:.*'clock' of node 'eye' is not connected")
-def test_in_process_no_round_of_a_free_run_begins_after_its_end(tmp_path: Path) -> None:
-    with neuros.Project.from_file(eye(tmp_path, LEAPS)).session(backend="in-process") as s:
+def test_in_one_thread_no_round_of_a_free_run_begins_after_its_end(tmp_path: Path) -> None:
+    with neuros.Project.from_file(eye(tmp_path, LEAPS)).session(backend="local") as s:
         assert s.run(duration_sim_s=2.0)
         assert s.sim_time == pytest.approx(100.03)
 
@@ -527,20 +478,21 @@ def test_a_notebook_shows_the_graph_and_the_hooks(held: Session) -> None:
     assert "<td>decide</td>" in shown
 
 
-def test_a_step_that_takes_too_long_is_waited_for_by_the_next(held: Session) -> None:
-    children = psutil.Process().children(recursive=True)
-    nodes = [each for each in children if str(held.folder) in " ".join(each.cmdline())]
-    before = held["robot.pose"].count
-    for node in nodes:
-        node.suspend()
-    try:
-        with pytest.raises(TimeoutError, match="has not come to rest in time"):
-            held.step(timeout_s=0.1)
-    finally:
+def test_a_step_that_takes_too_long_is_waited_for_by_the_next(tmp_path: Path) -> None:
+    with neuros.Project.from_file(cart(tmp_path)).session(backend="in-process") as s:
+        children = psutil.Process().children(recursive=True)
+        nodes = [each for each in children if str(s.folder) in " ".join(each.cmdline())]
+        before = s["robot.pose"].count
         for node in nodes:
-            node.resume()
-    held.step(timeout_s=DEADLINE_S)
-    assert held["robot.pose"].count == before + 2
+            node.suspend()
+        try:
+            with pytest.raises(TimeoutError, match="has not come to rest in time"):
+                s.step(timeout_s=0.1)
+        finally:
+            for node in nodes:
+                node.resume()
+        s.step(timeout_s=DEADLINE_S)
+        assert s["robot.pose"].count == before + 2
 
 
 def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_from_being_heard(
@@ -550,13 +502,12 @@ def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_f
         assert s["robot.pose"].count == 0
         with pytest.raises(TimeoutError):
             s.step(timeout_s=0.5)
-        s._held._link._supervisor.send(Advance(10_000, 0, {}))
+        s._held._supervisor.send(Advance(10_000, 0, {}))
         (s.folder / "brain" / "go").touch()
         s.step(timeout_s=DEADLINE_S)
         assert s["robot.pose"].count == 2
 
 
-@pytest.mark.filterwarnings("ignore:.*'image' of node 'brain' is not connected")
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_after_a_step_that_took_too_long_a_large_packet_and_a_large_answer_pass_each_other(
     tmp_path: Path, back_end: str
@@ -605,22 +556,6 @@ def test_a_round_that_never_ends_hinders_nothing_but_steps(tmp_path: Path, back_
         assert s["left.ball"].count == 1
 
 
-def test_a_step_that_arrives_once_the_run_goes_freely_does_not_hold_it(tmp_path: Path) -> None:
-    alarm = {"name": "eye", "plugin": "eye.py", "container": "neuros_python"}
-    (tmp_path / "eye.py").write_text(ALARM)
-    (tmp_path / "project.json").write_text(json.dumps({"nodes": [alarm]}))
-    with neuros.Project.from_file(tmp_path).session(backend="in-process") as s:
-        nodes = s._held._link._nodes
-        assert nodes is not None
-        s._held._link.send(Resume())
-        looks = s.folder / "eye" / "looks"
-        wait_until(looks.exists)
-        nodes.send(Advance(10_000, 1, {}))
-        assert select.select([nodes], [], [], DEADLINE_S)[0]
-        before = looks.stat().st_size
-        wait_until(lambda: looks.stat().st_size > before + 3)
-
-
 @pytest.mark.parametrize(
     "look",
     [
@@ -645,7 +580,6 @@ def test_after_a_step_that_took_too_long_who_waits_for_an_output_waits_for_the_r
         timer.join()
 
 
-@pytest.mark.filterwarnings("ignore:.*'image' of node 'eye' is not connected")
 def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_ending(
     tmp_path: Path,
 ) -> None:
@@ -663,15 +597,13 @@ def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_
                 s.step(timeout_s=0.0)
         finally:
             node.resume()
-        assert s._held._link._nodes is not None
-        assert select.select([s._held._link._nodes], [], [], DEADLINE_S)[0]
+        assert select.select([s._held._supervisor], [], [], DEADLINE_S)[0]
         s._held._live.interrupt()
         run = s._held._live.wait(DEADLINE_S)
     assert run.exit_code == 130
     assert run.nodes["eye"]["report"] == "final"
 
 
-@pytest.mark.filterwarnings("ignore:.*of node 'seer' is not connected")
 @pytest.mark.parametrize("backend", ["local", "in-process", "process"])
 def test_packets_that_are_sent_at_once_are_all_there_however_large(
     tmp_path: Path, backend: str
@@ -751,6 +683,14 @@ def test_wrong_values_are_refused_as_those_of_a_hook(held: Session) -> None:
         (lambda s: s.step(sim_s=float("nan")), "sim_s=nan: give 0 or more seconds"),
         (lambda s: s.run(duration_s=-1), "duration_s=-1: give 0 or more seconds"),
         (lambda s: s.run(duration_sim_s=float("inf")), "duration_sim_s=inf: give 0 or more"),
+        (lambda s: s.step(3, sim_s=0.1), "rounds and sim_s are lengths of one step: give one"),
+        (lambda s: s.step(until=bool, sim_s=1), "sim_s and until are lengths of one step"),
+        (lambda s: s.step(2.5), "rounds=2.5: give a whole number"),
+        (lambda s: s.step("2"), "rounds='2': give a whole number"),
+        (lambda s: s.step(True), "rounds=True: give 0 or more"),
+        (lambda s: s.step(until=True), "until=True: give a function that takes the session"),
+        (lambda s: s.step(sim_s="1"), "sim_s='1': give 0 or more seconds"),
+        (lambda s: s["robot"], "'robot' is a node: name one of its outputs, which are robot.pose"),
     ],
 )
 def test_a_length_that_is_none_is_refused(
@@ -788,11 +728,25 @@ def test_simulated_seconds_need_a_node_that_has_them(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ its end
 
 
-def test_a_block_that_fails_interrupts_the_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("error", "exit_code", "reason"),
+    [
+        (KeyError("gain"), 7, "the program failed: KeyError: 'gain'"),
+        (AssertionError(), 7, "the program failed: AssertionError"),
+        (KeyboardInterrupt(), 130, "ended by Ctrl+C"),
+    ],
+)
+def test_a_block_that_fails_ends_the_run_and_is_the_reason(
+    tmp_path: Path, error: BaseException, exit_code: int, reason: str
+) -> None:
     project = neuros.Project.from_file(cart(tmp_path))
-    with pytest.raises(ZeroDivisionError), project.session(backend="in-process") as s:
-        s.step(until=lambda s: s["robot.pose"].count and 1 / 0)
-    assert s.close().exit_code == 130
+    s = project.session(backend="in-process")
+    with pytest.raises(type(error)), s:
+        raise error
+    run = s.close()
+    assert (run.exit_code, run.reason) == (exit_code, reason)
+    with pytest.raises(RunError):
+        run.check()
 
 
 @pytest.mark.acceptance

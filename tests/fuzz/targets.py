@@ -481,8 +481,8 @@ SENT: Sequence[control.Message] = (
     control.End("done"),
     control.PhaseChanged("running", is_paused=False),
     control.Ended(0, "done", {}, 1.0, None),
-    control.Advance(3, 1, {"a.x": 2}, (("a", "y", b"12345678"),)),
-    control.AtRest(3, {"a": 0.5}, {"a.x": (3, b"1234"), "a.z": (1, b"")}),
+    control.Advance(3, 1, {"a.x": 2}),
+    control.AtRest(3, {"a": 0.5}, {"a.x": (3, [b"1234"]), "a.z": (1, [b""])}),
 )
 
 

@@ -132,7 +132,7 @@ def test_one_process_is_asked_once(asked: Asked) -> None:
     settling = Settling(["a", "b"], cast(Channels, asked))
     settling.ask(SESSION, Advance(1, 0, {"a.x": 3}))
     assert asked.rounds == [Advance(1, 0, {"a.x": 3})]
-    newest = {"a.x": (4, b"")}
+    newest = {"a.x": (4, [b""])}
     settling.take(AtRest(1, {"a": 0.5}, newest, ("a", "b")))
     assert asked.told == [AtRest(1, {"a": 0.5}, newest)]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -274,6 +275,37 @@ def test_a_long_hook_is_waited_for(run: Run) -> None:
     run(a=SHUTS_DOWN, b=DRAINED_AFTER_A_LONG_HOOK)
     assert run.lasted_s > 0.5
     assert not any("not drained" in text for text in run.output.said)
+
+
+@pytest.mark.parametrize("is_lossy", [False, True])
+def test_where_packets_come_uncounted_all_hooks_stop_before_any_node_does(
+    run: Run, is_lossy: bool
+) -> None:
+    """A hook that one of them starts could send to a node that has stopped."""
+    looks = """
+host.connections["outgoing"]["a.o -> b.x"] = SENT
+host.connections["incoming"]["a.o -> b.x"] = RECEIVED
+host.up()
+if NAMES == ["a"]:
+    host.tell("shutdown", reason="enough", drain_s=5)
+told = []
+while "stop" not in told:
+    message = host.hear()
+    told.append(message["kind"])
+    host.answer(message)
+Path(f"{NAMES[0]}.told").write_text(" ".join(told))
+host.report(is_final=True)
+"""
+    connection = wire("a.o -> b.x")
+    if is_lossy:
+        connection = replace(connection, discard_limit=None)
+    outcome = run(a=looks, b=looks, connections=(connection,))
+    assert (outcome.exit_code, outcome.failures) == (0, [])
+    for name in "ab":
+        told = (run.folder / f"{name}.told").read_text().split()
+        assert ("stop_hooks" in told) == is_lossy
+        if is_lossy:
+            assert "probe" in told[told.index("stop_hooks") : told.index("stop")]
 
 
 def test_but_not_longer_than_it_was_said(run: Run) -> None:

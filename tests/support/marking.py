@@ -38,8 +38,11 @@ REACHED = {
 # By the beginning of a test's path and name: what is reached through neuros, and what takes long.
 BY_NAME = {
     "ros": (
+        "api/test_arrays_in_programs.py::test_a_session",
         "api/test_free_runs.py",
+        "api/test_local_sessions.py",
         "api/test_python_api.py",
+        "api/test_reset_settings.py",
         "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
         "extensions/neuros-analysis/tests/test_report.py",
@@ -57,6 +60,7 @@ BY_NAME = {
         "conformance/test_conformance.py::test_what_once",
         "extensions/neuros-learn/tests/test_datasets.py",
         "extensions/neuros-learn/tests/test_gym_environments.py",
+        "extensions/neuros-learn/tests/test_gym_pictures.py",
         "integration/",
         "runtime/test_local_loop.py::test_a_free_run_serves_ros",
         "runtime/test_local_loop.py::test_events_timers_and_threads",

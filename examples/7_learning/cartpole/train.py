@@ -24,8 +24,8 @@ def make():
         HERE / "project.json",
         action="policy.force",
         observation=[f"{POSITION}[2]", f"{VELOCITY}[2]"],
-        reward=lambda env: 1.0,
-        done=lambda env: has_fallen(env.observation[POSITION]),
+        reward=lambda: 1.0,
+        done=lambda observation: has_fallen(observation[POSITION]),
         model="cart.xml",
         max_episode_steps=STEPS,
     )

@@ -22,8 +22,9 @@ from typing import Any
 from tabulate import tabulate
 
 from neuros.api.live import LiveRun
+from neuros.api.loading import override_texts, value_text
 from neuros.api.plan import time_problems
-from neuros.api.project import Project, override_texts, value_text
+from neuros.api.project import Project
 from neuros.api.request import Request
 from neuros.api.run import Run
 from neuros.api.run_record import consumed_percent

@@ -9,9 +9,10 @@ reinforcement learning environments", 2024.
 from __future__ import annotations
 
 import contextlib
+import inspect
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import reduce
 from math import prod
 from pathlib import Path
@@ -29,11 +30,12 @@ from neuros.project.suggest import did_you_mean
 from neuros.recording.provenance import seeds
 from neuros.transport.messages import message_class
 from neuros.transport.schema import NUMBERS, Leaf, Shape, Sort, getter, schema
+from neuros.visualise import image_pixels
 
 try:
     import gymnasium
-    from gymnasium import spaces
-    from gymnasium.wrappers import TimeLimit
+    from gymnasium import logger, spaces
+    from gymnasium.envs.registration import EnvSpec
 except ModuleNotFoundError as error:
     raise EnvironmentFault(
         f"neuros.gym needs Gymnasium, which is not installed here: {install_command('rl')}"
@@ -46,6 +48,13 @@ _MOST_ROUNDS = 100
 _SEEDS = 2**31
 _NOTHING: Mapping[str, tuple[Any, Any]] = {}
 _UNBOUNDED = (-np.inf, np.inf)
+_ENTRY_POINT = "neuros.gym:ProjectEnv"
+_IMAGE = "sensor_msgs/msg/Image"
+_RENDER_MODE = "rgb_array"
+_FPS = 30
+"""Frames per second where neither the step nor a sensor tells it, as of ``RecordVideo``."""
+_SEEN = ("observation", "previous_observation", "action", "session", "env")
+"""What the parameters of a function of the user can name."""
 
 
 def make(
@@ -62,38 +71,87 @@ def make(
             "project.json",
             action="policy.force",
             observation=["cart.joints.position[2]", "cart.joints.velocity[2]"],
-            reward=lambda env: 1.0,
-            done=lambda env: abs(env.observation["cart.joints.position"][1]) > 0.2,
+            reward=lambda: 1.0,
+            done=lambda observation: abs(observation["cart.joints.position"][1]) > 0.2,
             ranges={"policy.force": (-1.0, 1.0)},
             max_episode_steps=500,
         )
 
+    ``env.spec`` makes further ones; it can be pickled if the functions among the arguments can.
+
     Args:
         max_episode_steps: the number of steps after which an episode is ``truncated``.
+
+    Raises:
+        UsageError: that number is not a whole one from 1 on; or as the class.
     """
-    env = ProjectEnv(project, **arguments)
-    return env if max_episode_steps is None else TimeLimit(env, max_episode_steps)
+    _check_steps(max_episode_steps)
+    _check_names(arguments)
+    loaded = project if isinstance(project, Project) else Project.from_file(project)
+    name = re.sub(r"[^\w.-]", "_", loaded.name)
+    spec = EnvSpec(f"neuros/{name}-v0", _ENTRY_POINT, order_enforce=False, disable_env_checker=True)
+    return gymnasium.make(spec, max_episode_steps, project=loaded, **arguments)
+
+
+def register(
+    env_id: str,
+    project: str | os.PathLike[str] | Project,
+    *,
+    max_episode_steps: int | None = None,
+    **arguments: Any,
+) -> None:
+    """Let ``gymnasium.make(env_id)`` and ``gymnasium.make_vec(env_id)`` make such environments.
+
+    The project is read when an environment is made. Arguments of ``gymnasium.make`` replace those
+    given here.
+
+    Args:
+        env_id: name and version, ``neuros/Cartpole-v0``.
+        project, max_episode_steps, arguments: as of :func:`make`.
+
+    Raises:
+        UsageError: there is no argument of a name, or the number of steps is none.
+        gymnasium.error.Error: the name is not one of Gymnasium.
+    """
+    _check_steps(max_episode_steps)
+    _check_names(arguments)
+    # An environment may be made from another folder, or in another process.
+    found = project if isinstance(project, Project) else os.path.abspath(project)
+    gymnasium.register(
+        env_id,
+        _ENTRY_POINT,
+        max_episode_steps=max_episode_steps,
+        kwargs={"project": found, **arguments},
+    )
 
 
 class ProjectEnv(gymnasium.Env[Any, Any]):
     """An environment whose world is a project.
 
-    A name is ``node.port``, for all numbers of its message (without texts and time stamps), or
-    ``node.port.field``; a shape in brackets is needed where the message does not fix the length.
+    A name is ``node.port``, for its array, or all numbers of its message (without texts and time
+    stamps); or ``node.port.field``. A shape in brackets is needed where the message does not fix
+    the length.
     One name makes a ``Box``, a list a ``Dict`` of boxes, by the names without brackets.
 
     Args:
         project: its file, its folder, or a :class:`~neuros.api.project.Project`.
         action: an output, whose packets the environment sends in its place, or an input.
         observation: outputs.
-        reward: called after each step with the environment.
+        reward: a function, called after each step. It is given those of these values that its
+            parameters name: ``observation``, ``previous_observation`` (before the step),
+            ``action``, ``session``, and ``env``, this environment.
         done: likewise; returns whether the episode is over (``terminated``). The end of the
             project ends it, too.
+        truncated: likewise; returns whether the episode is cut short.
+        info: likewise; returns a mapping, which is added to the information of each step. It is
+            called after a reset, too; there is neither an action nor an observation before, then.
         ranges: lowest and highest value by name: numbers, or arrays.
         model: MJCF file, relative to the project file, with the ranges of the actuators that an
             action drives; ``ranges`` come first.
-        rounds, sim_s: length of a step, as for :meth:`Session.step`.
+        rounds, sim_s: length of a step, as for :meth:`Session.step`: one of them, or neither.
         initial_action: sent at each reset, for a project that waits for its first command.
+        render_mode: ``"rgb_array"``, or ``None``: pictures are not asked for.
+        render: the output that sends the pictures; it may be left out if only one sends images.
         options: of :meth:`~neuros.api.project.Project.session`.
 
     Attributes:
@@ -101,12 +159,14 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         action, observation: those of the last step.
 
     Raises:
-        UsageError: a name is that of no port or field, the number of its values is not known, or
-            the length of a step is negative.
+        UsageError: a name is that of no argument, port or field, the number of its values is not
+            known, the length of a step is negative, a function takes what there is not, or it is
+            not known which output sends the pictures.
         ProjectError, EnvironmentFault, RunError: as a session does.
     """
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012, as in the class above
+    # Of an environment without a camera, those of the instance are empty.
+    metadata: dict[str, Any] = {"render_modes": [_RENDER_MODE]}  # noqa: RUF012, as in the class above
 
     def __init__(
         self,
@@ -114,20 +174,39 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         *,
         action: str | Sequence[str],
         observation: str | Sequence[str],
-        reward: Callable[[ProjectEnv], SupportsFloat],
-        done: Callable[[ProjectEnv], bool] = lambda _: False,
+        reward: Callable[..., SupportsFloat],
+        done: Callable[..., bool] = lambda: False,
+        truncated: Callable[..., bool] = lambda: False,
+        info: Callable[..., Mapping[str, Any]] = lambda: _NOTHING,
         ranges: Mapping[str, tuple[Any, Any]] | None = None,
         model: str | os.PathLike[str] | None = None,
-        rounds: int = 1,
+        rounds: int | None = None,
         sim_s: float | None = None,
         initial_action: Any = None,
-        backend: str = "in-process",
+        render_mode: str | None = None,
+        render: str | None = None,
+        backend: str = "local",
         **options: Any,
     ) -> None:
-        check_length(rounds, sim_s)
+        _check_names(options)
+        count = check_length(rounds, sim_s)
+        self._reward, self._done, self._truncated, self._info = (
+            _by_names(role, function)
+            for role, function in (
+                ("reward", reward),
+                ("done", done),
+                ("truncated", truncated),
+                ("info", info),
+            )
+        )
         loaded = project if isinstance(project, Project) else Project.from_file(project)
-        described = loaded.check_with({})
-        self._reward, self._done = reward, done
+        described = loaded.check_with({}, is_held=True)
+        self._camera = _camera(described, render_mode, render)
+        self.render_mode = render_mode
+        self.metadata = {"render_modes": []}
+        if self._camera is not None:
+            fps = _steps_per_s(described, count, sim_s)
+            self.metadata = {"render_modes": [_RENDER_MODE], "render_fps": fps}
         self._rounds, self._sim_s, self._initial_action = rounds, sim_s, initial_action
         self._has_seeds = bool(seeds(described.nodes))
         taken = [
@@ -155,19 +234,23 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode: reset the session with the next seed, and run until all outputs sent.
 
+        Args:
+            options: ``{"set": {...}}``: settings, as for :meth:`Session.reset`.
+
         Raises:
-            UsageError: an observed output does not send.
+            UsageError: an observed output does not send, or there is another option.
         """
+        changes = _changes(options)
         super().reset(seed=seed)
         episode = int(self.np_random.integers(_SEEDS)) if self._has_seeds else None
-        self.session.reset(seed=episode)
+        self.session.reset(seed=episode, **changes)
         if self._initial_action is not None:
             self._send(self._initial_action)
         for _ in range(_MOST_ROUNDS):
             silent = [output for output in self._outputs.values() if not output.count]
             if not silent:
                 self.action, self.observation = None, self._observe()
-                return self.observation, self._info()
+                return self.observation, self._information(self._seen(None))
             self.session.step()
         raise UsageError(
             f"{silent[0].name} has sent nothing in {_MOST_ROUNDS} rounds after a reset: if the"
@@ -178,9 +261,38 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         """Send the action, step the project, and observe. Raises ``RunError`` if it fails."""
         self._send(action)
         goes_on = self.session.step(self._rounds, sim_s=self._sim_s)
-        self.action, self.observation = action, self._observe()
-        is_over = not goes_on or bool(self._done(self))
-        return self.observation, float(self._reward(self)), is_over, False, self._info()
+        before, self.action, self.observation = self.observation, action, self._observe()
+        seen = self._seen(before)
+        is_over = not goes_on or bool(self._done(seen))
+        reward = self._reward(seen)
+        try:
+            gained = float(reward)
+        except (TypeError, ValueError):
+            raise UsageError(f"reward returned {reward!r}, which is no number") from None
+        is_cut = bool(self._truncated(seen))
+        return self.observation, gained, is_over, is_cut, self._information(seen)
+
+    def render(self) -> Any:
+        """The newest picture of the camera, ``(height, width, 3)``, uint8, red first.
+
+        A camera of MuJoCo that has sent nothing yet in the episode shows black.
+
+        Raises:
+            UsageError: another camera has sent nothing yet, or the encoding of the picture is not
+                rgb8, bgr8 or mono8.
+        """
+        if self.render_mode is None or self._camera is None:
+            logger.warn(f"render: make the environment with render_mode='{_RENDER_MODE}'")
+            return None
+        name, port = self._camera
+        image = self.session[name].packet
+        if image is None:
+            return _black(name, port)
+        try:
+            pixels = image_pixels(image)
+        except ValueError as error:
+            raise UsageError(f"render: {name}: {error}") from error
+        return np.array(pixels) if pixels.ndim == 3 else np.stack([pixels] * 3, axis=-1)
 
     def close(self) -> None:
         """End the run, drained."""
@@ -199,9 +311,9 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
     ) -> None:
         """Find the numbers of all actions and observations. Raises as the class."""
         controls = {} if model is None else _controls(described, project.file.parent / model)
-        self._actions = [_Numbers(described, name, ranges, controls) for name in _listed(action)]
+        self._actions = [_numbers(described, name, ranges, controls) for name in _listed(action)]
         self._observations = [
-            _Numbers(described, name, ranges, is_output=True) for name in _listed(observation)
+            _numbers(described, name, ranges, is_output=True) for name in _listed(observation)
         ]
         names = [each.name for each in (*self._actions, *self._observations)]
         if unknown := ranges.keys() - {*names}:
@@ -218,9 +330,31 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         found = {each.name: each.read(packets[each.port]) for each in self._observations}
         return next(iter(found.values())) if self._has_one_observation else found
 
-    def _info(self) -> dict[str, Any]:
-        sim_time = self.session.sim_time
-        return {} if sim_time is None else {"sim_time": sim_time}
+    def _seen(self, before: Any) -> dict[str, Any]:
+        """What the user's functions are given, by :data:`_SEEN`."""
+        values = (self.observation, before, self.action, self.session, self)
+        return dict(zip(_SEEN, values, strict=True))
+
+    def _information(self, seen: Mapping[str, Any]) -> dict[str, Any]:
+        sim_time, own = self.session.sim_time, self._info(seen)
+        if not isinstance(own, Mapping):
+            raise UsageError(f"info returned {own!r}, which is no mapping")
+        return {**({} if sim_time is None else {"sim_time": sim_time}), **own}
+
+
+def _numbers(
+    project: Described,
+    written: str,
+    ranges: Mapping[str, tuple[Any, Any]],
+    controls: Mapping[str, tuple[Any, Any]] = _NOTHING,
+    *,
+    is_output: bool = False,
+) -> _Numbers:
+    """The numbers of a name; ``ranges`` are by name, ``controls`` by input."""
+    port = _port(project, _split(written)[0], is_output=is_output)
+    inputs = [] if is_output else _inputs_behind(project, _split(written)[0])
+    driven = controls.get(inputs[0]) if inputs else None
+    return (_ArrayNumbers if port.array else _Numbers)(port, written, inputs, ranges, driven)
 
 
 class _Numbers:
@@ -234,17 +368,20 @@ class _Numbers:
 
     def __init__(
         self,
-        project: Described,
+        port: Port,
         written: str,
+        inputs: Sequence[str],
         ranges: Mapping[str, tuple[Any, Any]],
-        controls: Mapping[str, tuple[Any, Any]] = _NOTHING,
-        *,
-        is_output: bool = False,
+        driven: tuple[Any, Any] | None,
     ) -> None:
         self.port, field, shape = _split(written)
         self.name = self.port + field
-        port = _port(project, self.port, is_output=is_output)
-        self.inputs = [] if is_output else _inputs_behind(project, self.port)
+        self.inputs = inputs
+        is_bool = self._resolve(port, written, field, shape)
+        self.space = self._space(ranges.get(self.name, (0, 1) if is_bool else driven))
+
+    def _resolve(self, port: Port, written: str, field: str, shape: tuple[int, ...] | None) -> bool:
+        """Find the numbers, their type and their shape; whether all are truth values."""
         self._kind = message_class(port.type)
         leaves = _numbers_of(self._kind, field)
         if not leaves:
@@ -268,8 +405,7 @@ class _Numbers:
         self._is_flat = all(leaf.field.shape is Shape.SINGLE for leaf in leaves)
         is_bool = all(leaf.field.type.sort is Sort.BOOL for leaf in leaves)
         self._dtype = np.dtype(np.uint8) if is_bool else np.result_type(*map(_dtype, leaves))
-        driven = controls.get(self.inputs[0]) if self.inputs else None
-        self.space = self._space(ranges.get(self.name, (0, 1) if is_bool else driven))
+        return is_bool
 
     def _space(self, bounds: tuple[Any, Any] | None) -> spaces.Box:
         if bounds is None:
@@ -314,12 +450,165 @@ class _Numbers:
         return message
 
 
+class _ArrayNumbers(_Numbers):
+    """The numbers of a port of arrays."""
+
+    def _resolve(self, port: Port, written: str, field: str, shape: tuple[int, ...] | None) -> bool:
+        array = port.array
+        assert array is not None
+        if field:
+            raise UsageError(
+                f"'{written}': {self.port} is a {array}, without fields: leave them out"
+            )
+        if shape is not None and prod(shape) != array.size:
+            raise UsageError(
+                f"'{written}': its arrays have {array.size} numbers, not {prod(shape)}"
+            )
+        self._array, self._shape = array, shape or array.shape
+        is_bool = array.dtype == "bool"
+        self._dtype = np.dtype(np.uint8 if is_bool else array.dtype)
+        return is_bool
+
+    def read(self, message: Any) -> Any:
+        """The numbers of an array."""
+        return np.array(message, self._dtype).reshape(self._shape)
+
+    def message(self, values: Any) -> Any:
+        """An array of these numbers; raises ``ValueError`` for one that does not fit."""
+        given, is_float = np.asarray(values), self._dtype.kind == "f"
+        if given.size != self._array.size:
+            raise UsageError(f"{self.name} takes {self._array.size} numbers, not {given.size}")
+        given = given.reshape(self._array.shape)
+        if given.dtype == self._array.dtype:
+            return given
+        if given.dtype.kind == "f" and not is_float:
+            given = np.rint(given)
+        with np.errstate(over="ignore", invalid="ignore"):
+            made = given.astype(self._array.dtype)
+        pair = (np.isfinite(made), np.isfinite(given)) if is_float else (made, given)
+        if not np.array_equal(*pair):
+            raise ValueError(f"{self.name}: {values} does not fit in {self._array}")
+        return made
+
+
 _CONVERT: Mapping[Sort, Callable[[Any], list[Any]]] = {
     Sort.BOOL: lambda numbers: numbers.astype(bool).tolist(),
     Sort.INTEGER: lambda numbers: [round(number) for number in numbers.tolist()],
     Sort.FLOAT: lambda numbers: numbers.astype(float).tolist(),
 }
 """Converters from an array of numbers to values of a field."""
+
+
+def _check_steps(number: Any) -> None:
+    """Gymnasium would complain when the session has started. Raises ``UsageError``."""
+    if number is not None and (not isinstance(number, int) or number < 1):
+        raise UsageError(f"max_episode_steps={number!r}: give a whole number from 1 on")
+
+
+def _check_names(arguments: Iterable[str]) -> None:
+    """Refuse arguments that :func:`make` does not have. Raises ``UsageError``."""
+    own = {*inspect.signature(ProjectEnv).parameters} - {"project", "options"}
+    # An environment takes the inputs of its actions over.
+    known = own | {*inspect.signature(Project.session).parameters} - {"self", "take_over"}
+    for name in arguments:
+        if name not in known:
+            hint = did_you_mean(name, known) or f"it has {', '.join(sorted(own))}"
+            raise UsageError(f"neuros.gym.make has no argument '{name}' ({hint})")
+
+
+def _by_names(role: str, function: Callable[..., Any]) -> Callable[[Mapping[str, Any]], Any]:
+    """A function that is given those of the values of :data:`_SEEN` that its parameters name.
+
+    Raises:
+        UsageError: if a parameter names another, or the parameters are not known.
+    """
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError) as error:
+        raise UsageError(
+            f"{role}: {function!r} is no function with known parameters; give a function of"
+            f" {', '.join(_SEEN[:-1])}, or of some of them"
+        ) from error
+    names = []
+    for each in parameters:
+        if each.name in _SEEN and each.kind is not each.POSITIONAL_ONLY:
+            names.append(each.name)
+        elif each.default is each.empty and each.kind not in (
+            each.VAR_POSITIONAL,
+            each.VAR_KEYWORD,
+        ):
+            hint = did_you_mean(each.name, _SEEN) or f"there are {', '.join(_SEEN)}"
+            raise UsageError(f"{role}: there is nothing for its parameter '{each.name}' ({hint})")
+    return lambda seen: function(**{name: seen[name] for name in names})
+
+
+def _changes(options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The arguments of :meth:`Session.reset` in the options of a reset; raises ``UsageError``."""
+    for name in options or ():
+        if name != "set":
+            raise UsageError(
+                f"reset: there is no option '{name}'; settings are"
+                ' options={"set": {"nodes.NAME.environment.VARIABLE": value}}'
+            )
+    settings = (options or {}).get("set")
+    if not isinstance(settings, Mapping | None):
+        raise UsageError(f"reset: options: 'set' is a mapping of settings, not {settings!r}")
+    return {} if settings is None else {"set": settings}
+
+
+def _camera(
+    project: Described, render_mode: str | None, render: str | None
+) -> tuple[str, Port] | None:
+    """The output that sends the pictures, and its name; ``None`` if none is needed, nor clear.
+
+    Raises:
+        UsageError: if it cannot be had.
+    """
+    if render_mode not in (None, _RENDER_MODE):
+        raise UsageError(f"render_mode={render_mode!r}: there is '{_RENDER_MODE}', or None")
+    if render is not None:
+        port = _port(project, render, is_output=True)
+        if port.type != _IMAGE:
+            raise UsageError(f"render='{render}': the output sends {port.type}, not {_IMAGE}")
+        return render, port
+    cameras = [
+        (f"{node.name}.{port.name}", port)
+        for node in project.nodes
+        for port in node.outputs
+        if port.type == _IMAGE
+    ]
+    if len(cameras) == 1:
+        return cameras[0]
+    if render_mode is None:
+        return None
+    names = [name for name, _ in cameras]
+    if not names:
+        raise UsageError(f"render_mode='{render_mode}': no output of {project.name} sends {_IMAGE}")
+    raise UsageError(
+        f"render_mode='{render_mode}': {project.name} has the cameras {', '.join(names)}: choose"
+        f" one, for example with render='{names[0]}'"
+    )
+
+
+def _steps_per_s(project: Described, rounds: int, sim_s: float | None) -> float:
+    """Steps per simulated second: a frame of a video is a step. Sensors of MuJoCo pace rounds."""
+    rates = [p.mujoco["rate"] for node in project.nodes for p in node.outputs if "rate" in p.mujoco]
+    if sim_s:
+        return 1 / sim_s
+    return max(rates) / max(rounds, 1) if rates else _FPS
+
+
+def _black(name: str, port: Port) -> Any:
+    """The picture of a camera that has sent none: another size later would spoil a video."""
+    if not port.mujoco:
+        raise UsageError(
+            f"render: {name} has sent no picture yet in this episode: let the hook that begins an"
+            " episode send one"
+        )
+    from neuros.simulators.mujoco.sensor_base import PICTURE
+
+    size = (port.mujoco.get(key, PICTURE[key].default) for key in ("height", "width"))
+    return np.zeros((*size, 3), np.uint8)
 
 
 def _listed(names: str | Sequence[str]) -> Sequence[str]:
@@ -384,8 +673,9 @@ def _controls(project: Described, model: Path) -> dict[str, tuple[Any, Any]]:
     for node in project.nodes:
         for port in node.inputs:
             wanted = port.mujoco.get("actuators", [port.mujoco.get("actuator")])
-            if all(name in names for name in wanted):
-                low, high = limits[[names.index(name) for name in wanted]].T
+            if wanted == "all" or all(name in names for name in wanted):
+                chosen = slice(None) if wanted == "all" else [names.index(each) for each in wanted]
+                low, high = limits[chosen].T
                 found[f"{node.name}.{port.name}"] = low, high
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import shutil
 import subprocess
@@ -37,16 +38,26 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("ROS_DOMAIN_ID", raising=False)
 
 
+def one() -> float:
+    return 1.0
+
+
+def has_fallen(observation: Any) -> bool:
+    return bool(abs(observation[POSITION][1]) > 0.2)
+
+
+CART_POLE: dict[str, Any] = {
+    "action": "policy.force",
+    "observation": OBSERVED,
+    "reward": one,
+    "done": has_fallen,
+    "model": "cart.xml",
+    "max_episode_steps": 50,
+}
+
+
 def cart_pole(**others: Any) -> gymnasium.Env[Any, Any]:
-    arguments: dict[str, Any] = {
-        "action": "policy.force",
-        "observation": OBSERVED,
-        "reward": lambda env: 1.0,
-        "done": lambda env: abs(env.observation[POSITION][1]) > 0.2,
-        "model": "cart.xml",
-        "max_episode_steps": 50,
-    }
-    return neuros.gym.make(EXAMPLE / "project.json", **(arguments | others))
+    return neuros.gym.make(EXAMPLE / "project.json", **(CART_POLE | others))
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +74,12 @@ def episode(env: gymnasium.Env[Any, Any], seed: int | None, steps: int = 5) -> l
     return [each[POSITION].tolist() for each in found]
 
 
-def test_the_checker_of_gymnasium_finds_no_fault(env: gymnasium.Env[Any, Any]) -> None:
+def test_the_checker_of_gymnasium_finds_no_fault() -> None:
+    made = cart_pole()
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*Box observation space m.* is .*infinity")
-        check_env(env.unwrapped, skip_render_check=True)
+        check_env(made.unwrapped)
+    made.close()
 
 
 def test_a_seed_gives_one_sequence_of_episodes(env: gymnasium.Env[Any, Any]) -> None:
@@ -175,17 +188,13 @@ def sensors(tmp_path: Path) -> Path:
     return tmp_path
 
 
-NOT_CONNECTED = pytest.mark.filterwarnings("ignore:.*of node 'robot' is not connected")
-
-
-@NOT_CONNECTED
 def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
     env = neuros.gym.make(
         sensors,
         action=["robot.order", "robot.flag"],
         observation=["robot.scan.data[2,3]", "robot.imu", "robot.imu.angular_velocity"],
-        reward=lambda env: env.observation["robot.imu.angular_velocity"][2],
-        done=lambda env: env.session["robot.done"].packet.data,
+        reward=lambda observation: observation["robot.imu.angular_velocity"][2],
+        done=lambda session: session["robot.done"].packet.data,
         ranges={"robot.order": (-2, [1, 2, 3, 4, 5, 6])},
     )
     try:
@@ -213,7 +222,6 @@ def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
         env.close()
 
 
-@NOT_CONNECTED
 @pytest.mark.parametrize(
     ("changed", "complaint"),
     [
@@ -233,6 +241,18 @@ def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
         ({"ranges": {"robot.order": 3}}, "range of robot.order: "),
         ({"ranges": {"robot.flag": (0, 300)}, "action": "robot.flag"}, "range of robot.flag: "),
         ({"model": "nothing.xml"}, "nothing.xml"),
+        ({"rendermode": "rgb_array"}, r"neuros\.gym\.make has no .*did you mean 'render_mode'\?"),
+        ({"ouput": "run"}, r"no argument 'ouput' \(did you mean 'output'\?\)"),
+        ({"rounds": 1, "sim_s": 0.1}, "rounds and sim_s are lengths of one step: give one of them"),
+        ({"rounds": 1.5}, "rounds=1.5: give a whole number"),
+        ({"take_over": "robot.flag"}, "no argument 'take_over'"),
+        ({"max_episode_steps": 0}, "max_episode_steps=0: give a whole number from 1 on"),
+        ({"max_episode_steps": 2.5}, "max_episode_steps=2.5: give a whole number"),
+        ({"max_episode_steps": "50"}, "max_episode_steps='50': give a whole number"),
+        ({"reward": lambda obs: 0.0}, "reward: there is nothing for its parameter 'obs' .*there"),
+        ({"done": lambda actions: False}, r"done: .*'actions' \(did you mean 'action'\?\)"),
+        ({"truncated": True}, "truncated: True is no function .*give a function of observation"),
+        ({"info": dict}, "info: <class 'dict'> is no function with known parameters"),
     ],
 )
 def test_what_cannot_be_is_said_with_what_can(
@@ -244,8 +264,183 @@ def test_what_cannot_be_is_said_with_what_can(
     assert not (sensors / "runs").exists()
 
 
+def test_functions_get_what_their_parameters_name(sensors: Path) -> None:
+    def gained(
+        action: Any, previous_observation: Any, observation: Any, scale: float = 2.0
+    ) -> float:
+        return scale * float(observation[2] - previous_observation[2]) - 0.5 * float(action[0])
+
+    env = neuros.gym.make(
+        sensors,
+        action="robot.order",
+        observation="robot.imu.angular_velocity",
+        reward=gained,
+        done=lambda env, action: env.action is not action,
+        truncated=lambda observation: observation[2] > 3.0,
+        info=lambda action, previous_observation, session: {
+            "first": previous_observation is None and action is None,
+            "sent": session["robot.done"].count,
+        },
+    )
+    try:
+        _, info = env.reset()
+        assert info == {"first": True, "sent": 1}
+        *_, reward, terminated, truncated, info = env.step(np.array([3.0, 0, 0, 0, 0, 0]))
+        assert (reward, terminated, truncated) == (2.0 * (3.0 - 2.0) - 0.5 * 3.0, False, False)
+        assert info == {"first": False, "sent": 2}
+        *_, truncated, info = env.step(np.array([3.5, 0, 0, 0, 0, 0]))
+        assert truncated
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("changed", "complaint"),
+    [
+        ({"reward": lambda: None}, "reward returned None, which is no number"),
+        ({"reward": lambda observation: "much"}, "reward returned 'much', which is no number"),
+        (
+            {"info": lambda action: {} if action is None else 3},
+            "info returned 3, which is no mapping",
+        ),
+    ],
+)
+def test_what_a_function_must_return_is_said(
+    sensors: Path, changed: dict[str, Any], complaint: str
+) -> None:
+    arguments = {"action": "robot.order", "observation": "robot.done", "reward": float}
+    env = neuros.gym.make(sensors, **(arguments | changed))
+    try:
+        env.reset()
+        with pytest.raises(UsageError, match=complaint):
+            env.step(np.zeros(6))
+    finally:
+        env.close()
+
+
+class TestOptionsOfAReset:
+    @pytest.mark.parametrize(
+        ("options", "complaint"),
+        [
+            ({"nonsense": 1}, "reset: there is no option 'nonsense'; settings are options=.*set"),
+            ({"set": {}, "seed": 3}, "reset: there is no option 'seed'"),
+            (
+                {"set": "nodes.cart.environment.MASS=2"},
+                "'set' is a mapping of settings, not 'nodes",
+            ),
+        ],
+    )
+    def test_that_there_are_not_are_refused(
+        self, env: gymnasium.Env[Any, Any], options: dict[str, Any], complaint: str
+    ) -> None:
+        before = episode(env, 7)
+        episode(env, 7)
+        random = env.unwrapped.np_random.bit_generator.state
+        with pytest.raises(UsageError, match=complaint):
+            env.reset(seed=1, options=options)
+        assert env.unwrapped.np_random.bit_generator.state == random
+        assert episode(env, 7) == before
+
+    def test_settings_hold_until_the_next_reset(self, env: gymnasium.Env[Any, Any]) -> None:
+        def speed(options: dict[str, Any] | None) -> float:
+            env.reset(seed=7, options=options)
+            return float(env.step(np.array([1.0]))[0][VELOCITY][0])
+
+        usual = speed(None)
+        slack = speed({"set": {"cart.model.actuator_gear": 0.0}})
+        assert usual > slack + 0.1
+        assert [speed(options) for options in (None, {}, {"set": None}, {"set": {}})] == 4 * [usual]
+
+    def test_a_setting_of_a_node_that_there_is_not_is_refused(
+        self, env: gymnasium.Env[Any, Any]
+    ) -> None:
+        with pytest.raises(UsageError, match=r"no node 'card' \(did you mean 'cart'\?\)"):
+            env.reset(options={"set": {"card.model.actuator_gear": 0.0}})
+
+
+class TestRegistration:
+    """Environments by a name, as Gymnasium makes them."""
+
+    ID = "neuros/CartPole-v3"
+
+    @pytest.fixture(autouse=True)
+    def _registered(self, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+        monkeypatch.chdir(EXAMPLE)
+        neuros.gym.register(self.ID, "project.json", **CART_POLE)
+        monkeypatch.undo()  # back in the folder of the test
+        yield
+        del gymnasium.registry[self.ID]
+
+    @pytest.fixture(autouse=True)
+    def _infinite(self) -> Iterator[None]:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", ".*Box observation space m.* is .*infinity")
+            yield
+
+    def test_a_name_makes_the_environment_in_any_folder(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, env: gymnasium.Env[Any, Any]
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        made = gymnasium.make(self.ID, max_episode_steps=3)
+        try:
+            assert episode(made, 7, steps=3) == episode(env, 7, steps=3)
+            assert made.spec is not None
+            assert made.spec.id == self.ID
+            assert made.spec.max_episode_steps == 3
+        finally:
+            made.close()
+
+    @pytest.mark.acceptance
+    def test_a_specification_survives_pickling_and_makes_the_same_environment(
+        self, env: gymnasium.Env[Any, Any]
+    ) -> None:
+        for known in (gymnasium.spec(self.ID), env.spec):
+            made = pickle.loads(pickle.dumps(known)).make(output=None)
+            try:
+                assert episode(made, 7) == episode(env, 7)
+                assert made.spec.max_episode_steps == 50
+            finally:
+                made.close()
+
+    @pytest.mark.acceptance
+    @pytest.mark.parametrize(("mode", "more"), [("sync", {}), ("async", {"context": "spawn"})])
+    def test_a_vector_has_a_run_for_each(
+        self,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        mode: str,
+        more: dict[str, Any],
+        env: gymnasium.Env[Any, Any],
+    ) -> None:
+        monkeypatch.chdir(tmp_path)
+        envs = gymnasium.make_vec(self.ID, num_envs=2, vectorization_mode=mode, vector_kwargs=more)
+        try:
+            seen, _ = envs.reset(seed=[7, 8])
+            found = [each.tolist() for each in seen[POSITION]]
+        finally:
+            envs.close()
+        assert found == [episode(env, seed, steps=0)[0] for seed in (7, 8)]
+
+    def test_a_project_of_any_name_has_a_specification(self, tmp_path: Path) -> None:
+        folder = shutil.copytree(EXAMPLE, tmp_path / "der Läufer: v2 (alt)")
+        made = neuros.gym.make(folder, **CART_POLE)
+        try:
+            assert made.spec is not None
+            assert made.spec.id == "neuros/der_Läufer__v2__alt_-v0"
+        finally:
+            made.close()
+
+    def test_an_argument_that_there_is_not_is_refused_at_once(self) -> None:
+        with pytest.raises(UsageError, match=r"no argument 'actions' \(did you mean 'action'\?\)"):
+            neuros.gym.register("neuros/Other-v0", EXAMPLE, actions="policy.force")
+        assert "neuros/Other-v0" not in gymnasium.registry
+
+    def test_an_argument_of_gymnasium_make_that_there_is_not_is_refused(self) -> None:
+        with pytest.raises(UsageError, match=r"neuros\.gym\.make has no argument 'ranges_of'"):
+            gymnasium.make(self.ID, ranges_of={})
+
+
 @pytest.mark.acceptance
-@NOT_CONNECTED
 def test_a_length_that_messages_do_not_have_is_said_with_that_they_have(sensors: Path) -> None:
     arguments = {"action": "robot.order", "observation": "robot.scan.data[7]", "reward": float}
     env = neuros.gym.make(sensors, **arguments)
@@ -257,7 +452,6 @@ def test_a_length_that_messages_do_not_have_is_said_with_that_they_have(sensors:
 
 
 @pytest.mark.acceptance
-@NOT_CONNECTED
 def test_a_project_that_waits_for_a_command_gets_one_at_each_reset(tmp_path: Path) -> None:
     def brain(**others: Any) -> gymnasium.Env[Any, Any]:
         return neuros.gym.make(
@@ -354,3 +548,119 @@ def _upright_s(example: Path, folder: Path, seeds: Sequence[int]) -> list[float]
         for seed in seeds
     ]
     return [run.node_results["policy"]["upright_s"] for run in runs]
+
+
+# ---------------------------------------------------------------------- ports of arrays
+
+# Of Gymnasium's model.
+DEPRECATED = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
+SIMULATORS = ROOT / "docs" / "simulators.md"
+
+
+def cheetah(folder: Path) -> Path:
+    """The half-cheetah of the page, whose action and observation are arrays."""
+    model = Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml"
+    shutil.copy(model, folder)
+    page = SIMULATORS.read_text("utf-8").partition("### Arrays\n")[2]
+    node, plugin = re.findall(r"```(?:json|python)\n(.*?)```", page, re.DOTALL)[:2]
+    (folder / "cheetah.py").write_text(plugin)
+    (folder / "project.json").write_text(f'{{"nodes": [{node}]}}')
+    return folder
+
+
+def run_cheetah(folder: Path, **others: Any) -> gymnasium.Env[Any, Any]:
+    arguments: dict[str, Any] = {
+        "action": "cheetah.action",
+        "observation": "cheetah.observation",
+        "reward": lambda env: float(env.observation[8]),
+        "model": "half_cheetah.xml",
+    }
+    return neuros.gym.make(cheetah(folder), **(arguments | others))
+
+
+@DEPRECATED
+def test_ports_of_arrays_have_spaces_of_their_type_and_shape(tmp_path: Path) -> None:
+    env = run_cheetah(tmp_path)
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float64)
+    assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (17,), np.float64)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*Box observation space m.* is .*infinity")
+        check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+@DEPRECATED
+def test_a_cheetah_of_arrays_is_bare_mujoco_bit_for_bit(tmp_path: Path) -> None:
+    import mujoco
+
+    env = run_cheetah(tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "half_cheetah.xml"))
+    for _ in range(2):
+        observation, _ = env.reset()
+        bare = mujoco.MjData(model)
+        mujoco.mj_step(model, bare, nstep=5)  # without an action
+        assert np.array_equal(observation, np.concatenate([bare.qpos[1:], bare.qvel]))
+        for action in np.random.default_rng(1).uniform(-1, 1, (100, 6)):
+            observation = env.step(action)[0]
+            bare.ctrl[:] = action
+            mujoco.mj_step(model, bare, nstep=5)
+            assert observation.tobytes() == np.concatenate([bare.qpos[1:], bare.qvel]).tobytes()
+        observation[:] = 0  # is the program's own
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"action": "cheetah.action.data[6]"}, r"cheetah.action is a float64\[6\], without fields"),
+        ({"observation": "cheetah.observation[18]"}, "its arrays have 17 numbers, not 18"),
+        ({"action": "cheetah.actoin"}, "did you mean 'cheetah.action'"),
+    ],
+)
+def test_wrong_names_of_arrays_are_told(tmp_path: Path, arguments: Any, text: str) -> None:
+    with pytest.raises(UsageError, match=text):
+        run_cheetah(tmp_path, **arguments)
+
+
+MIRROR = """
+from neuros.hooks import Optional, neuros_function
+
+@neuros_function(inputs=[Optional("on"), Optional("level")], outputs=[Optional("is_on"), "image"])
+def show(node, on, level):
+    image = node.make_packet("image")
+    if level is not None:
+        image[:] = level.reshape(2, 2)
+    return on if on is None else ~on, image
+"""
+
+
+def test_arrays_of_bools_and_whole_numbers_and_any_shape(tmp_path: Path) -> None:
+    (tmp_path / "mirror.py").write_text(MIRROR)
+    types = {"on": "bool[2]", "level": "uint8[4]", "is_on": "bool[2]", "image": "float32[2,2]"}
+    ports = [{"name": name, "type": kind} for name, kind in types.items()]
+    node = {"name": "m", "container": "neuros_python", "plugin": "mirror.py"}
+    node |= {"inputs": ports[:2], "outputs": ports[2:]}
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [node]}))
+    env = neuros.gym.make(
+        tmp_path,
+        action=["m.on", "m.level"],
+        observation=["m.is_on", "m.image"],
+        reward=lambda env: 0.0,
+        initial_action={"m.on": [0, 0], "m.level": [0, 0, 0, 0]},
+        output=tmp_path / "run",
+    )
+    box = gymnasium.spaces.Box
+    assert env.action_space["m.on"] == box(0, 1, (2,), np.uint8)
+    assert env.action_space["m.level"] == box(0, 255, (4,), np.uint8)
+    assert env.observation_space["m.image"] == box(-np.inf, np.inf, (2, 2), np.float32)
+    env.reset()
+    action = {"m.on": np.array([0, 1], np.uint8), "m.level": np.array([1.0, 2.0, 3.4, 255.0])}
+    seen = env.step(action)[0]
+    assert seen["m.is_on"].tolist() == [1, 0]
+    assert seen["m.image"].tolist() == [[1.0, 2.0], [3.0, 255.0]]
+    for wrong in ([0, 0, 0, 256], [0, 0, 0, -1], [0, 0, 0, np.nan]):
+        with pytest.raises(ValueError, match=r"m.level: .* does not fit in uint8\[4\]"):
+            env.step(action | {"m.level": np.array(wrong)})
+    with pytest.raises(UsageError, match=r"m\.on takes 2 numbers, not 3"):
+        env.step(action | {"m.on": np.zeros(3)})
+    env.close()
