@@ -142,12 +142,10 @@ class LocalRun:
             if self._is_behind or not rounds:
                 self._come_to_rest()
             for _ in range(rounds):
-                if end_sim_s is not None and (self._sim_time() or 0.0) >= end_sim_s:
+                if end_sim_s is not None and max(self._sim_times().values(), default=0.0) >= end_sim_s:
                     break
-                is_driven = any(
-                    node.engine is not None and node.engine.is_driving for node in nodes
-                )
                 self._is_behind = True
+                is_driven = self._is_driven
                 for node in nodes:
                     node.step(1, is_driven=is_driven)
                 self._come_to_rest()
@@ -305,9 +303,16 @@ class LocalRun:
         for deliver in sent:
             deliver()
 
-    def _sim_time(self) -> float | None:
-        times = (node.sim_time for node in self._nodes.values())
-        return max((time_s for time_s in times if time_s is not None), default=None)
+    @property
+    def _is_driven(self) -> bool:
+        for node in self._nodes.values():
+            if node.engine is not None and node.engine.is_driving:
+                return True
+        return False
+
+    def _sim_times(self) -> dict[str, float]:
+        nodes = self._nodes.values()
+        return {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None}
 
     def _rest(self, known: Mapping[str, int]) -> AtRest | None:
         if self._failed_or_over():
@@ -324,8 +329,7 @@ class LocalRun:
             history = self._nodes[node_name].histories.by_output.get(output)
             if history is not None and history.count > number:
                 packets[name] = history.count, history.since(number)
-        times = {n.name: time_s for n in self._nodes.values() if (time_s := n.sim_time) is not None}
-        return AtRest(0, times, packets)
+        return AtRest(0, self._sim_times(), packets)
 
     def _inside(self, end_s: float | None = None) -> _Thread:
         """The thread of the program for nodes, until a time (monotonic, seconds)."""

@@ -282,7 +282,7 @@ class Engine:
     @property
     def is_driving(self) -> bool:
         """Whether it has hooks that start unasked, and so drive the project."""
-        return any(hook.drives for hook in tuple(self.all_hooks))
+        return any([hook.drives for hook in tuple(self.all_hooks)])
 
     @property
     def tick_start_ns(self) -> int:
