@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.api.live import LiveRun
-from neuros.api.project import Project as Loaded
+from neuros.api.project import _project_of
 from neuros.backends.domain import choose_domain
 from neuros.errors import NeurosError
 
@@ -167,7 +167,7 @@ def run_in(
                 live = _Program(file, run_folder, duration or 2 * LONGEST_S, domain.id)
             else:
                 named = _BACK_ENDS.get(backend, {"backend": backend})
-                live = Loaded(file, {}).start(
+                live = _project_of(file, {}).start(
                     duration=duration, output=run_folder, domain_id=domain.id, **named
                 )
             _wait(live, project, run_folder, seconds, observed)

@@ -16,7 +16,7 @@ def main(file: str, folder: str, seconds: str) -> None:
     """Run, and end the run, drained."""
     faulthandler.enable()  # says where it stands when it is killed
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
-    with Project.from_file(file).session(output=folder) as session:
+    with Project.from_file(file).session(backend="local", output=folder) as session:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         session.run(duration_s=float(seconds))
 
