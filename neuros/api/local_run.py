@@ -142,7 +142,10 @@ class LocalRun:
             if self._is_behind or not rounds:
                 self._come_to_rest()
             for _ in range(rounds):
-                if end_sim_s is not None and max(self._sim_times().values(), default=0.0) >= end_sim_s:
+                if (
+                    end_sim_s is not None
+                    and max(self._sim_times().values(), default=0.0) >= end_sim_s
+                ):
                     break
                 self._is_behind = True
                 is_driven = self._is_driven

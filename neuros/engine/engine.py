@@ -230,7 +230,10 @@ class Engine:
         """
         if self._pause.is_on:
             self._pause.end(self._wake())
-            self._end_pass()
+            self._cause = self.rest()
+            if self._cause is SCHEDULING and not self._has_posted_loop_back:
+                self._has_posted_loop_back = True
+                self._effects.post_loop_back(self.on_loop_back)
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let each hook that starts unasked do so ``count`` times more.
@@ -383,11 +386,6 @@ class Engine:
                         self._run(hook)
             finally:
                 self._is_passing = False
-        self._end_pass()
-
-    def _end_pass(self) -> None:
-        """Find out what the node waits for; if for nothing, go on with a loop-back."""
-        lifecycle, pause = self._lifecycle, self._pause
         if lifecycle.is_stopped:
             self._cause = self.rest()
         elif pause.is_on:

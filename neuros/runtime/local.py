@@ -166,8 +166,18 @@ class LocalLoop:
         """Handle events and timers until :meth:`stop`; with ROS, in one queue with its events."""
         while self.ros is None and not self._is_stopping:
             self._go_on(None)
-        if self.ros is not None:
-            self._follow(self.ros)
+        if self.ros is None:
+            return
+        ros = self._leader = self.ros
+        self.post, self.post_loop_back = ros.post, ros.post_loop_back
+        for timer in self._timers:
+            ros.add_timer(*timer)
+        for event in self._events:
+            ros.post(event)
+        self._events.clear()
+        self._post_arrived()
+        if not self._is_stopping:
+            ros.run()
 
     def take_in(self) -> None:
         """After :meth:`run`: handle what had arrived by then, so that it is counted."""
@@ -203,19 +213,6 @@ class LocalLoop:
             self.wait(left_s)
         if self._timers:
             self.run_due_timers()
-
-    def _follow(self, ros: RosLoop) -> None:
-        """Leave all events and timers to the loop of ROS."""
-        self._leader = ros
-        self.post, self.post_loop_back = ros.post, ros.post_loop_back
-        for timer in self._timers:
-            ros.add_timer(*timer)
-        for event in self._events:
-            ros.post(event)
-        self._events.clear()
-        self._post_arrived()
-        if not self._is_stopping:
-            ros.run()
 
     def _post_arrived(self) -> None:
         while not self._from_threads.empty():
