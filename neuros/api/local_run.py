@@ -373,6 +373,7 @@ class LocalRun:
             because = f": {message.reason}" if message.reason else ""
             reason = f"{message.node} ended the project{because}"
             self._end = reason, message.drain_s, message.node
+            self._loop.end_run()
 
     def _fail(self, name: str, error: NeurosError) -> None:
         if name in self._nodes:
@@ -382,6 +383,7 @@ class LocalRun:
         self.error = self.error or error
         first_line = (str(error).strip() or "no reason was given").splitlines()[0]
         self._outcome.fail(f"node '{name}' failed: {first_line}")
+        self._loop.end_run()
         for node in self._nodes.values():
             node.stop()
 
@@ -410,10 +412,15 @@ class LocalRun:
             return
         outcome = self._outcome
         outcome.begin_to_end(time.monotonic())
+        interruption: KeyboardInterrupt | None = None
         try:
             if self._end is not None and not outcome.failures and self._is_active:
                 outcome.reason, drain_s, stopped = self._end
-                self._drain(drain_s, stopped)
+                try:
+                    self._drain(drain_s, stopped)
+                except KeyboardInterrupt as error:
+                    interruption = error
+                    outcome.fail("ended by Ctrl+C", EXIT_CODES[signal.SIGINT])
             with self._inside():
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
@@ -428,6 +435,8 @@ class LocalRun:
                 LocalRun._nest_user = None
             self._record()
             self._run = Run(self.folder)
+        if interruption is not None:
+            raise interruption
 
     def _drain(self, drain_s: float, stopped: str) -> None:
         last_round = self._declarations.last_round(stopped)
@@ -563,7 +572,7 @@ class _Thread:
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
         if not self._is_inside or self._loop.interruption is not None:
             signal.default_int_handler(number, frame)
-        self._loop.interruption = KeyboardInterrupt()
+        self._loop.interrupt(KeyboardInterrupt())
 
 
 def _uses_nest(node: Node) -> bool:
@@ -611,7 +620,7 @@ class _Watchdog:
     def _watch(self) -> None:
         if self._is_over.wait(max(0.0, self._end_s - time.monotonic())):
             return
-        self._loop.interruption = TimeoutError("the run has not come to rest in time")
+        self._loop.interrupt(TimeoutError("the run has not come to rest in time"))
         if self._is_over.wait(_GRACE_S):
             return
         with self._lock:

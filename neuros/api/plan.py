@@ -206,7 +206,7 @@ class Plan:
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
         """The launcher of the back end; it reports its processes to ``reaper``."""
-        options = ["--transport", self.back_end.transport]
+        options = ["--transport", self.deployment.transport or self.back_end.transport]
         if self.back_end.is_one_process:
             options.append("--one-process")
         if self.request.end.sim_s is not None:

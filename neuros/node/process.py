@@ -302,7 +302,7 @@ class NodeProcess:
         self._tell(control.Loaded())
         self._may_begin.wait()  # meanwhile nothing of ROS is handled: nobody can send here
         if not self.is_ending:
-            middleware.loop.run()
+            self._guard(middleware.loop.run)
             middleware.take_in()
 
     def _begin(self) -> None:

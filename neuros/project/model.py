@@ -288,6 +288,11 @@ class NodeFile:
     list_bytes: int = 64_000_000
     restored: Mapping[str, str] = field(default_factory=lambda: _NOTHING, hash=False)
 
+    @property
+    def logger_name(self) -> str:
+        """The name of its logger in ROS, which rcl makes from namespace and name."""
+        return f"{self.names.namespace}/{self.node.name}"[1:].replace("/", ".")
+
 
 @dataclass(frozen=True)
 class Budgets:

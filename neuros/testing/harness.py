@@ -92,7 +92,7 @@ class Neighbours:
             self._started[connection] = position
             if connection.is_reliable:
                 node = self._hub.inboxes[connection.source_node]
-                self._hub.post(partial(node.on_acknowledgement, connection, position))
+                self._hub.loop.post(partial(node.on_acknowledgement, connection, position))
 
     # ------------------------------------------------------------------ inbox
 
@@ -118,7 +118,7 @@ class Neighbours:
         while waiting and not window.is_blocked:
             window.spend(0)
             node = self._hub.inboxes[connection.destination_node]
-            self._hub.post(partial(node.on_packet, connection, waiting.popleft()))
+            self._hub.loop.post(partial(node.on_packet, connection, waiting.popleft()))
 
 
 class PluginHarness:
