@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from ros_program import RosProgram
-from transport_checks import TransportChecks
+from transport_checks import TOPIC, TransportChecks
 
 from neuros.backends.domain import choose_domain
 from neuros.ports import Transport, TransportKind
@@ -91,11 +91,18 @@ class TestMemoryTransportOnRos(TransportChecks):
         return RosNetwork([files], MEMORY)
 
 
+class UnseenNetwork(RosNetwork):
+    """Nodes whose connections have no topics on the ROS graph."""
+
+    def listen(self, topic: str, type_name: str) -> list[Any] | None:
+        return super().listen(topic, type_name) if topic == TOPIC else None
+
+
 class TestLocalTransport(TransportChecks):
     """All nodes in one process, with ROS for their external topics alone."""
 
     def network(self, files: Sequence[NodeFile]) -> RosNetwork:
-        return RosNetwork([files], LOCAL)
+        return UnseenNetwork([files], LOCAL)
 
 
 class TestRosTransportOnAWaitSet(TestRosTransport):
