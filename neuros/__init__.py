@@ -1,8 +1,9 @@
 """NeuROS: closed perception-action loops of simulators, spiking networks and robots, on ROS 2.
 
 Plugins import what they declare with from :mod:`neuros.hooks`; everything else reaches them
-through the ``node`` object that every hook receives. Programs run projects with :class:`Project`,
-and look at what comes out with :class:`Run`.
+through the ``node`` object that every hook receives, a :class:`NodeHandle`. Programs describe
+projects with :class:`Node` and :class:`Connection`, run them with :class:`Project`, and look at
+what comes out with :class:`Run`.
 """
 
 import sys
@@ -12,14 +13,24 @@ if TYPE_CHECKING:
     from neuros.api.project import Project
     from neuros.api.run import Run
     from neuros.distribution import __version__
-    from neuros.node.handle import NodeHandle as Node
+    from neuros.node.handle import NodeHandle
+    from neuros.project.in_python import PythonConnection as Connection
+    from neuros.project.in_python import PythonNode as Node
 
-__all__ = ["Node", "Project", "Run", "__version__"]
+__all__ = ["Connection", "Node", "NodeHandle", "Project", "Run", "__version__"]
 
 
 def __getattr__(name: str) -> Any:
     """Import these only when they are asked for: every node imports this package."""
+    if name == "Connection":
+        from neuros.project.in_python import PythonConnection
+
+        return PythonConnection
     if name == "Node":
+        from neuros.project.in_python import PythonNode
+
+        return PythonNode
+    if name == "NodeHandle":
         from neuros.node.handle import NodeHandle
 
         return NodeHandle

@@ -82,6 +82,10 @@ class RecordedTopic:
         for packet in self.raw():
             yield packet, self._bag.message(packet.data, self.type)
 
+    def __iter__(self) -> Iterator[Any]:
+        """The messages, in the order of their wall time."""
+        return (message for _, message in self.messages())
+
     def message(self, place: int) -> Any:
         """The message at a place, from 0. Raises ``IndexError``."""
         return self._bag.message(self.raw()[place].data, self.type)

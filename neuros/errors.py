@@ -112,14 +112,14 @@ class WrongValue(NeurosError, ValueError):
     """A message holds a value that its definition does not allow.
 
     Attributes:
-        path: of the field, ``poses[3].position.y``; empty if the message itself is of another type.
+        path: of the field, ``poses[3].position.y``; empty if the packet itself is of another type.
         found: the value and its type, in words.
         allowed: the type of the field and its range, in words.
     """
 
-    def __init__(self, path: str, found: str, allowed: str) -> None:
+    def __init__(self, path: str, found: str, allowed: str, packet: str = "the message") -> None:
         self.path, self.found, self.allowed = path, found, allowed
-        what = f"field '{path}'" if path else "the message"
+        what = f"field '{path}'" if path else packet
         super().__init__(f"{what} must be {allowed}, but is {found}")
 
 

@@ -44,7 +44,7 @@ __all__ = [
     "neuros_tick",
 ]
 
-_MARK = "__neuros_hooks__"
+MARK = "__neuros_hooks__"
 _RUNNERS = {"neuros.api.project", "neuros.node.node", "neuros.testing.harness"}
 """The modules that run hooks: a program that has imported one is more than a plugin."""
 
@@ -181,7 +181,7 @@ def neuros_finalise() -> Callable[[_Function], _Function]:
     return _marker(HookKind.FINALISE, None, None)
 
 
-def hook_specs_of(namespace: dict[str, Any]) -> tuple[HookSpec, ...]:
+def hook_specs_of(namespace: Mapping[Any, Any]) -> tuple[HookSpec, ...]:
     """The marks of all functions in a module's namespace, in the order of their declaration."""
     functions = {id(value): value for value in namespace.values() if _marks(value)}
     return tuple(
@@ -194,7 +194,7 @@ def hook_specs_of(namespace: dict[str, Any]) -> tuple[HookSpec, ...]:
 def _marks(value: object) -> tuple[HookSpec, ...]:
     # Not getattr: lazy modules and mocks, which plugins have in their namespace too, answer to any
     # name. A decorator above ours that uses functools.wraps copies the marks to its own function.
-    marks: tuple[HookSpec, ...] = getattr(value, "__dict__", {}).get(_MARK, ())
+    marks: tuple[HookSpec, ...] = getattr(value, "__dict__", {}).get(MARK, ())
     return marks
 
 
@@ -235,7 +235,7 @@ def _marker(
         if function.__module__ == "__main__":
             _explain_at_exit(getattr(sys.modules["__main__"], "__file__", None))
         # A function may carry several marks; the uppermost decorator is applied last.
-        setattr(function, _MARK, (spec, *_marks(function)))
+        setattr(function, MARK, (spec, *_marks(function)))
         return function
 
     return mark

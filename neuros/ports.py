@@ -89,16 +89,19 @@ class Transport(Protocol):
 
 
 class Packets(Protocol):
-    """Operations on packets, compiled once per message class."""
+    """Operations on packets, compiled once per type.
 
-    def message_class(self, type_name: str) -> type:
-        """The class of a message type in ROS notation. Raises ``EnvironmentFault``."""
+    A type is that of a port: a message type in ROS notation, or that of arrays, ``float64[18]``.
+    """
+
+    def packet_class(self, type_name: str) -> type:
+        """The message class of a type, or NumPy's array. Raises ``EnvironmentFault``."""
 
     def make(self, type_name: str) -> Packet:
-        """A new message with default values, for a type in ROS notation."""
+        """A new message with default values, or an array of zeros."""
 
-    def checker(self, kind: type, *, for_jpeg: bool = False) -> Callable[[Packet], Packet]:
-        """A check of packets of a class, also for JPEG.
+    def checker(self, type_name: str, *, for_jpeg: bool = False) -> Callable[[Packet], Packet]:
+        """A check of packets of a type, also for JPEG.
 
         The check returns the packet with the values that receivers see; raises ``WrongValue``.
         """
@@ -110,7 +113,7 @@ class Packets(Protocol):
         """A packet in the serialisation of ROS."""
 
     def decode(self, type_name: str, data: bytes) -> Packet:
-        """The inverse of :meth:`encode`, for a type in ROS notation."""
+        """The inverse of :meth:`encode`; arrays are read-only."""
 
 
 class Way(str, Enum):
@@ -494,8 +497,13 @@ Notice: TypeAlias = tuple[str, str]  # a line for the user: severity (INFO, WARN
 
 
 class Deployment(ABC):
-    """A back end ready for some nodes; the defaults are for nodes with this machine's paths."""
+    """A back end ready for some nodes; the defaults are for nodes with this machine's paths.
 
+    Attributes:
+        transport: the name of the transport of the nodes, if not that of the back end.
+    """
+
+    transport = ""
     notices: Sequence[Notice] = ()
     places: Mapping[str, str] = {}
     """The machine of each node that runs on another one."""

@@ -171,6 +171,12 @@ def _rows(file: Path, group: str) -> Iterator[tuple[str, str]]:
             yield name, value
 
 
+def own_packages() -> set[str]:
+    """The packages of NeuROS and of its extensions."""
+    rows = (row.partition(" = ") for row in EXTENSIONS.read_text("utf-8").splitlines())
+    return {US, *(f"{US}_{extension}" for _, _, extension in rows if extension)}
+
+
 AUTO = "auto"
 """The name for the best usable back end."""
 

@@ -67,7 +67,13 @@ PACKAGES = (
 # neuros itself holds public names; every package may ask it for the version. Those of others
 # it imports when they are asked for.
 PUBLIC_NAMES = Package(2, ("",))
-OWNERS = {"Node": "node", "Project": "api", "Run": "api"}
+OWNERS = {
+    "Connection": "project",
+    "Node": "project",
+    "NodeHandle": "node",
+    "Project": "api",
+    "Run": "api",
+}
 PORTS = 3
 
 MESSAGES = {"builtin_interfaces", "geometry_msgs", "nav_msgs", "rosgraph_msgs", "sensor_msgs"}
@@ -79,6 +85,7 @@ GENERATORS |= {"rosidl_adapter", "rosidl_cli"}
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
     "control": {"msgspec"},
+    "node.keeping": {"numpy"},
     "time": {"builtin_interfaces"},
     "transport": {
         "numpy",

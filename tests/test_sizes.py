@@ -28,15 +28,15 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 47_007)
+    hold("lines of neuros/", lines(NEUROS), 49_966)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 60_205)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 63_480)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 79_389)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 82_210)
 
 
 def test_private_functions_that_are_used_once() -> None:

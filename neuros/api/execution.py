@@ -38,6 +38,7 @@ from neuros.backends.console import (
 from neuros.backends.control_sockets import UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
+from neuros.backends.process_launchers import WITHOUT_ROS
 from neuros.backends.reaper import Reaper
 from neuros.backends.sessions import RunOnThisMachine, reaper_environment, this_process
 from neuros.backends.sidecars import Recorded
@@ -62,7 +63,7 @@ class Execution:
         stream: where the run is shown, ``None``: nowhere.
         signals: numbers of the signals that have arrived; signal handlers append to it.
         waker: bytes arrive here with each signal and each wish.
-        wishes: reasons for which this program ends the run, drained.
+        wishes: reason and exit code of each end that this program asks for.
         views: viewers that show the run while it goes on.
 
     Raises:
@@ -76,7 +77,7 @@ class Execution:
         stream: TextIO | None,
         signals: list[int],
         waker: socket.socket,
-        wishes: Sequence[str] = (),
+        wishes: list[tuple[str, int]] | None = None,
         views: Sequence[View] = (),
     ) -> None:
         self._plan = plan
@@ -98,7 +99,7 @@ class Execution:
             self._domain = run_domain(plan, self._recording_plan)
             stack.callback(self._domain.release)
             self.folder = make_run_folder(plan.request.output, plan.project.name)
-            self._files = write_node_files(plan, self.folder)
+            self._plan, self._files = write_node_files(plan, self.folder)
             self._listener = plan.deployment.control_listener(self.folder) or UnixListener(
                 self.folder
             )
@@ -156,7 +157,8 @@ class Execution:
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
             commands = f"neuros topic list {self._run_id[:8]}"
-            if not self._plan.request.isolate:
+            is_hidden = self._plan.deployment.transport == WITHOUT_ROS
+            if not (self._plan.request.isolate or is_hidden):
                 commands += f", or ROS_DOMAIN_ID={self._domain.id} ros2 topic list"
             self._console.log("INFO", f"to look into it: {commands}")
             for severity, notice in self._plan.notices:

@@ -17,6 +17,10 @@ from typing import Any
 from neuros.api.execution import Execution
 from neuros.api.plan import Plan
 from neuros.api.run import Run
+from neuros.launcher.outcome import EXIT_CODES, SIGNAL_NAMES
+
+PROGRAM_FAILED = 7
+"""The exit code of a run whose program has failed."""
 
 
 class LiveRun:
@@ -38,7 +42,7 @@ class LiveRun:
 
     def __init__(self, plan: Plan, *, is_shown: bool) -> None:
         self._signals: list[int] = []
-        self._wishes: list[str] = []
+        self._wishes: list[tuple[str, int]] = []
         self._reader, self._writer = socket.socketpair()
         self._writer.setblocking(False)
         self._done = threading.Event()
@@ -85,7 +89,15 @@ class LiveRun:
 
     def stop(self, reason: str = "stopped by the program") -> None:
         """End the run as if ``--duration`` were over: drained, with exit code 0."""
-        self._wishes.append(reason)
+        self._wishes.append((reason, 0))
+        self._wake()
+
+    def fail(self, reason: str, exit_code: int) -> None:
+        """End the run now, since this program has failed; after Ctrl+C, as :meth:`interrupt`."""
+        if exit_code == EXIT_CODES[signal.SIGINT]:
+            self.interrupt()
+            return
+        self._wishes.append((reason, exit_code))
         self._wake()
 
     def interrupt(self) -> None:
@@ -143,7 +155,7 @@ class LiveRun:
         if error is None:
             self.stop()
         else:
-            self.interrupt()
+            self.fail(*why_it_ended(error))
         self.wait()
 
     def __repr__(self) -> str:
@@ -175,6 +187,14 @@ class LiveRun:
     def _end_with_program(self) -> None:
         self.interrupt()
         self._done.wait()
+
+
+def why_it_ended(error: BaseException) -> tuple[str, int]:
+    """The reason and the exit code of a run whose program fails."""
+    if isinstance(error, KeyboardInterrupt):
+        return f"ended by {SIGNAL_NAMES[signal.SIGINT]}", EXIT_CODES[signal.SIGINT]
+    text = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
+    return f"the program failed: {text}", PROGRAM_FAILED
 
 
 class _CurrentOutput(io.TextIOBase):

@@ -26,12 +26,13 @@ from neuros.distribution import WORKSPACE, python_command
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
+from neuros.project.in_python import PythonProject
 from neuros.project.load import LoadedProject, load_project
 from neuros.project.loops import Loops, modules_beside
 from neuros.project.message_types import unknown_type
 from neuros.project.model import MODEL_FIELDS, NETWORK_MODULE, Node, Project
 from neuros.project.paths import is_missing, modules_here, why_no_module
-from neuros.project.plugin_files import PluginFile, read_plugin
+from neuros.project.plugin_files import PluginFile, plugins_of
 from neuros.project.scanner import display_name, problem_in
 from neuros.project.suggest import did_you_mean
 from neuros.recording.provenance import seeds
@@ -47,7 +48,7 @@ _LINE = re.compile(r"\bline (?:number=)?(\d+)", re.IGNORECASE)
 
 
 def load_with_messages(
-    path: Path,
+    path: Path | PythonProject,
     overrides: Sequence[str] = (),
     namespace: str | None = None,
     remap: Sequence[str] = (),
@@ -62,7 +63,7 @@ def load_with_messages(
     Raises:
         ProjectError: with all problems of the project and of its message files.
     """
-    workspaces = workspaces_of(path)
+    workspaces = workspaces_of(path if isinstance(path, Path) else path.folder)
     try:
         loaded = load_project(
             path,
@@ -177,7 +178,7 @@ def _unknown_in_containers(project: Project, workspaces: Workspaces) -> Iterator
         for side, ports in (("inputs", node.inputs), ("outputs", node.outputs)):
             for index, port in enumerate(ports):
                 unknown = unknown_type(port.type, must_be_here=True, packages=workspaces)
-                package = port.type.partition("/")[0]
+                package = port.ros_type.partition("/")[0]
                 if unknown and not _names_package(container.folder, package):
                     yield problem_in(node.file, f"{node.pointer}/{side}/{index}/type", *unknown)
         package = node.module.partition(".")[0]
@@ -238,7 +239,7 @@ def _lacking(
     folders = [str(node.plugin.parent), *filter(None, path), *map(str, messages.paths)]
     built = {each.package for each in messages.built}
     container = find_container(node.container, project.folder)
-    for part in islice(_parts(node.plugin), None if looks_beside else 1):
+    for part in islice(_parts(node), None if looks_beside else 1):
         for needed in part.needs:
             top = needed.name.partition(".")[0]
             text = ""
@@ -276,7 +277,7 @@ def model_problems(project: Project) -> list[Problem]:
     """
     problems: list[Problem] = []
     for node in project.nodes:
-        parts = [*_parts(node.plugin)]
+        parts = [*_parts(node)]
         models = [(part, argument) for part in parts for argument in part.model_arguments]
         if len(models) == 1 and find_spec("mujoco") is not None:
             (part, argument), sets_timestep = models[0], any(p.sets_timestep for p in parts)
@@ -353,10 +354,9 @@ def _problems_of_model(node: Node, model: Path | str, *, sets_timestep: bool) ->
             yield Problem(display_name(file), *place, "", row.removeprefix(f"{file}: "))
 
 
-def _parts(plugin: Path) -> Iterator[PluginFile]:
-    """A plugin, and the modules beside it that it imports."""
-    read = read_plugin(plugin) if plugin != Path() else None
-    if read is not None:
+def _parts(node: Node) -> Iterator[PluginFile]:
+    """The plugin of a node, and the modules beside it that it imports; nothing of functions."""
+    for read in plugins_of(node) if not node.hooks else ():
         yield read
         yield from modules_beside(read)
 

@@ -19,11 +19,11 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar
 
+from neuros.api.live import why_it_ended
 from neuros.api.plan import Plan
 from neuros.api.run import Run
 from neuros.api.run_folder import make_run_folder, removed_folders, save_record, write_node_files
 from neuros.api.run_record import EXIT_ENVIRONMENT, judge, run_record, run_table
-from neuros.api.session_link import why_it_ended
 from neuros.backends.console import format_record
 from neuros.control import AtRest, Message, NodeStatus, Ready, Shutdown
 from neuros.errors import NeurosError, UsageError
@@ -81,7 +81,7 @@ class LocalRun:
         with _Thread.turn:  # else the current folder and the environment may be those of nodes
             self.folder = make_run_folder(request.output, project.name)
             self._contexts = ContextSwitch()
-        self._files = write_node_files(plan, self.folder)
+        _, self._files = write_node_files(plan, self.folder, keeps_functions=True)
         self._outcome = Outcome()
         self._declarations = Declarations(self._files)
         self._ready: set[str] = set()
@@ -150,12 +150,13 @@ class LocalRun:
             if self._is_behind or not rounds:
                 self._come_to_rest()
             for _ in range(rounds):
-                if end_sim_s is not None and (self._sim_time() or 0.0) >= end_sim_s:
+                if (
+                    end_sim_s is not None
+                    and max(self._sim_times().values(), default=0.0) >= end_sim_s
+                ):
                     break
-                is_driven = any(
-                    node.engine is not None and node.engine.is_driving for node in nodes
-                )
                 self._is_behind = True
+                is_driven = self._is_driven
                 for node in nodes:
                     node.step(1, is_driven=is_driven)
                 self._come_to_rest()
@@ -202,7 +203,9 @@ class LocalRun:
             return None
         return [node.reports.look({}, 0) for node in self._nodes.values()]
 
-    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def reset(
+        self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
+    ) -> bool:
         """Bring all nodes back to their start, if they can be; see :meth:`HeldRun.reset`."""
         nodes = self._nodes.values()
         is_fixed = self._thread.has_threads or any(node.why_not_reset for node in nodes)
@@ -215,7 +218,7 @@ class LocalRun:
             self._loop.run_until_idle()
             for node in nodes:
                 try:
-                    node.reset(variables.get(node.name, {}))
+                    node.reset(variables.get(node.name, {}), keep.get(node.name, ()))
                 except NeurosError as error:
                     self._fail(node.name, error)
                     break
@@ -296,8 +299,6 @@ class LocalRun:
             is_local=True,
         )
         node.load()
-        if _uses_nest(file.node):
-            self._contexts.claim("nest")
         self._declarations.take(declared(node.name, node.specs))
 
     def _activate(self) -> None:
@@ -322,9 +323,16 @@ class LocalRun:
         for deliver in sent:
             deliver()
 
-    def _sim_time(self) -> float | None:
-        times = (node.sim_time for node in self._nodes.values())
-        return max((time_s for time_s in times if time_s is not None), default=None)
+    @property
+    def _is_driven(self) -> bool:
+        for node in self._nodes.values():
+            if node.engine is not None and node.engine.is_driving:
+                return True
+        return False
+
+    def _sim_times(self) -> dict[str, float]:
+        nodes = self._nodes.values()
+        return {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None}
 
     def _rest(self, known: Mapping[str, int]) -> AtRest | None:
         if self._failed_or_over():
@@ -341,8 +349,7 @@ class LocalRun:
             history = self._nodes[node_name].histories.by_output.get(output)
             if history is not None and history.count > number:
                 packets[name] = history.count, history.since(number)
-        times = {n.name: time_s for n in self._nodes.values() if (time_s := n.sim_time) is not None}
-        return AtRest(0, times, packets)
+        return AtRest(0, self._sim_times(), packets)
 
     def _inside(self, end_s: float | None = None) -> _Thread:
         """The thread of the program for nodes, until a time (monotonic, seconds)."""
@@ -381,6 +388,7 @@ class LocalRun:
             because = f": {message.reason}" if message.reason else ""
             reason = f"{message.node} ended the project{because}"
             self._end = reason, message.drain_s, message.node
+            self._loop.end_run()
 
     def _fail(self, name: str, error: NeurosError) -> None:
         if name in self._nodes:
@@ -390,6 +398,7 @@ class LocalRun:
         self.error = self.error or error
         first_line = (str(error).strip() or "no reason was given").splitlines()[0]
         self._outcome.fail(f"node '{name}' failed: {first_line}")
+        self._loop.end_run()
         for node in self._nodes.values():
             node.stop()
 
@@ -419,10 +428,15 @@ class LocalRun:
             return
         outcome = self._outcome
         outcome.begin_to_end(time.monotonic())
+        interruption: KeyboardInterrupt | None = None
         try:
             if self._end is not None and not outcome.failures and self._is_active:
                 outcome.reason, drain_s, stopped = self._end
-                self._drain(drain_s, stopped)
+                try:
+                    self._drain(drain_s, stopped)
+                except KeyboardInterrupt as error:
+                    interruption = error
+                    outcome.fail("ended by Ctrl+C", EXIT_CODES[signal.SIGINT])
             with self._inside():
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
@@ -436,6 +450,8 @@ class LocalRun:
             if LocalRun._nest_user is self:
                 LocalRun._nest_user = None
             self._run = self._record()
+        if interruption is not None:
+            raise interruption
 
     def _drain(self, drain_s: float, stopped: str) -> None:
         last_round = self._declarations.last_round(stopped)
@@ -638,7 +654,7 @@ class _Thread:
         if loop is None or loop.interruption is not None:
             signal.default_int_handler(number, frame)
         else:
-            loop.interruption = KeyboardInterrupt()
+            loop.interrupt(KeyboardInterrupt())
 
 
 def _uses_nest(node: Node) -> bool:
@@ -694,7 +710,7 @@ class _Watchdog:
     def _watch(self) -> None:
         if self._is_over.wait(max(0.0, self.end_s - time.monotonic())):
             return
-        self._loop.interruption = TimeoutError("the run has not come to rest in time")
+        self._loop.interrupt(TimeoutError("the run has not come to rest in time"))
         if self._is_over.wait(_GRACE_S):
             return
         with self._lock:

@@ -7,11 +7,12 @@ import json
 import os
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.api.kept import given_sources
 from neuros.api.live import LiveRun
 from neuros.api.loading import (
     foreseen_failures,
@@ -22,16 +23,18 @@ from neuros.api.loading import (
     with_model_fields,
 )
 from neuros.api.plan import make_environments, make_plan
+from neuros.api.plugin_text import PluginText, write_project
 from neuros.api.request import Request
 from neuros.api.run import Run
 from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.options import option, takes
 from neuros.project.graph import graph_mermaid, graph_text
+from neuros.project.in_python import PythonConnection, PythonNode, PythonProject
 from neuros.project.load import LoadedProject
 from neuros.project.model import Project as Described
 from neuros.project.split import project_to_json
-from neuros.registry import AUTO
+from neuros.registry import AUTO, own_packages
 
 if TYPE_CHECKING:
     from neuros.api.session import Session
@@ -110,23 +113,44 @@ class Project:
         run = project.run(duration="5sim", set={"nodes.robot.environment.RATE": 0.5}, seed=7)
         print(run.real_time_factor, run.node_results["visualiser"])
 
+    or be described in Python::
+
+        project = neuros.Project(nodes=[cart, brain], connections=[cart["x"] >> brain["x"]])
+
     Attributes:
-        file: the project file.
+        file: the project file; it stands only for the folder of a project in Python.
         settings: by path, values that replace those in the files.
+
+    Args:
+        nodes: of the project, :class:`neuros.Node`.
+        connections: between them: ``a["x"] >> b["y"]``, or :class:`neuros.Connection`.
+        folder: from which paths in the project begin; ``None``: the current folder.
+        keys: the other keys of a project file: ``description``, ``budgets``, ``namespace``, ....
+
+    Raises:
+        UsageError: if an argument is of another type, or there is no such folder.
+        ProjectError: with all problems of the project.
     """
 
-    def __init__(self, file: Path, settings: Mapping[str, Any]) -> None:
-        self.settings = dict(settings)
-        self._path = file
-        self._loaded = self._load()
-        self._warned = {*self._loaded.warnings}
-        self.file = self._loaded.project.file
+    def __init__(
+        self,
+        nodes: Iterable[PythonNode],
+        connections: Iterable[PythonConnection] = (),
+        *,
+        folder: str | os.PathLike[str] | None = None,
+        **keys: Any,
+    ) -> None:
+        self._open(PythonProject.of(nodes, connections, folder, keys), {})
+        self._warned.clear()
+        self._warn(self._loaded, is_held=True)
 
     @classmethod
     def from_file(
         cls, path: str | os.PathLike[str], *, set: Mapping[str, Any] | None = None
     ) -> Project:
         """Load and check a project; possible mistakes are Python warnings.
+
+        A port without a connection is told of when a run starts, since a session may use it.
 
         Args:
             path: the project file, or a folder that holds ``project.json``.
@@ -136,10 +160,17 @@ class Project:
         Raises:
             ProjectError: with all problems.
         """
-        project = cls(Path(path).absolute(), set or {})
-        for warning in project._loaded.warnings:
-            warnings.warn(str(warning), stacklevel=2)
+        project = _project_of(Path(path).absolute(), set or {})
+        project._warned.clear()
+        project._warn(project._loaded, is_held=True)
         return project
+
+    def _open(self, source: Path | PythonProject, settings: Mapping[str, Any]) -> None:
+        self.settings = dict(settings)
+        self._source = source
+        self._loaded = self._load()
+        self._warned = {*self._loaded.warnings}  # a copy, as in another process, says nothing
+        self.file = self._loaded.project.file
 
     @property
     def name(self) -> str:
@@ -167,16 +198,23 @@ class Project:
         Raises:
             ProjectError: if the project is not valid with these values.
         """
-        return Project(self._path, {**self.settings, **settings})
+        project = _project_of(self._source, {**self.settings, **settings})
+        project._warned -= project._loaded.unconnected
+        return project
 
-    def check_with(self, settings: Mapping[str, Any], seed: int | None = None) -> Described:
+    def check_with(
+        self, settings: Mapping[str, Any], seed: int | None = None, *, is_held: bool = False
+    ) -> Described:
         """Check the project as a run with these values does; returns its model.
+
+        Args:
+            is_held: whether it is for a session, which may use ports without a connection.
 
         Raises:
             ProjectError: with all problems.
             UsageError: if there is a seed, and no node has a variable for it.
         """
-        return self._load_for_run(StartOptions(set=settings, seed=seed))[0]
+        return self._load_for_run(StartOptions(set=settings, seed=seed), is_held=is_held)[0]
 
     def text(self) -> str:
         """The whole project as JSON, node files merged in."""
@@ -188,7 +226,7 @@ class Project:
         Raises:
             ProjectError: with all problems.
         """
-        self._loaded, messages = load_with_messages(self._path, override_texts(self.settings))
+        self._loaded, messages = load_with_messages(self._source, override_texts(self.settings))
         project = self._loaded.project
         if problems := [*model_problems(project), *foreseen_failures(project, messages)]:
             raise ProjectError(problems)
@@ -200,6 +238,28 @@ class Project:
         if form not in drawn:
             raise ValueError(f"{form!r} is neither 'text' nor 'mermaid'")
         return drawn[form](self._loaded.project)
+
+    def to_json(
+        self, folder: str | os.PathLike[str] | None = None, *, overwrite: bool = False
+    ) -> Path:
+        """Write a project in Python as files that `neuros launch` runs; returns the project file.
+
+        These are ``project.json``, a file for each node, and plugins of the functions; nodes with
+        the same functions share one. Settings of the project are in them.
+
+        Args:
+            folder: where; ``None``: the folder of the project. It is made if it does not exist.
+            overwrite: whether to replace files that are there already.
+
+        Raises:
+            UsageError: if a function cannot stand in a file, a file is there already, or paths in
+                the project lead to files that the folder lacks.
+        """
+        if isinstance(self._source, Path):
+            raise UsageError(f"to_json: {self.name} has its files already: {self.file}")
+        target = self.file.parent if folder is None else Path(folder).absolute()
+        texts = override_texts(self.settings)
+        return write_project(self._source, self._loaded.project, texts, target, overwrite=overwrite)
 
     @takes(RunOptions)
     def run(self, options: RunOptions) -> Run:
@@ -251,20 +311,23 @@ class Project:
             )
         count = itertools.count(1)
 
-        def prepare(seed: int | None, settings: Mapping[str, Any]) -> Callable[[], Held]:
+        def prepare(
+            seed: int | None, settings: Mapping[str, Any]
+        ) -> Callable[[Mapping[str, Any]], Held]:
             wanted = options.set
             if isinstance(wanted, Mapping):
                 wanted = with_model_fields(self._loaded.project, wanted)
             given = [*override_texts(wanted), *override_texts(settings)]
             chosen = replace(options, seed=seed, set=given)
-            project, messages = self._load_for_run(chosen)
+            project, messages = self._load_for_run(chosen, is_held=True)
             held, inputs = with_session_inputs(project, options.take_over)
 
-            def start() -> Held:
+            def start(restore: Mapping[str, Any]) -> Held:
                 number, output = next(count), None
                 if options.output is not None:  # out, out-2, out-3
                     output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
-                own = replace(chosen, output=output)
+                restored = {**given_sources(options.restore), **restore}
+                own = replace(chosen, output=output, restore=restored)
                 run: HeldRun
                 if options.backend == LOCAL:
                     plan = make_plan(held, messages, replace(own, backend=IN_PROCESS))
@@ -281,9 +344,9 @@ class Project:
 
         return Session(prepare, options.seed)
 
-    def __reduce__(self) -> tuple[type[Project], tuple[Path, dict[str, Any]]]:
+    def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the path: the files are read again."""
-        return Project, (self._path, self.settings)
+        return _project_of, (self._source, self.settings)
 
     def __repr__(self) -> str:
         counts = f"{len(self.nodes)} nodes, {len(self.connections)} connections"
@@ -301,6 +364,15 @@ class Project:
         *,
         is_held: bool = False,
     ) -> LiveRun:
+        for node in project.nodes:
+            if not node.hooks:
+                continue
+            if options.deployment is not None:
+                raise UsageError(
+                    f"deployment: other machines do not have the functions of '{node.name}': write"
+                    " the project with to_json(folder), and start that"
+                )
+            PluginText(node.name, node.hooks)  # fails before there is a run folder
         plan = replace(make_plan(project, messages, options), is_held=is_held)
         if options.isolate and not plan.back_end.has_own_network:
             raise UsageError(
@@ -315,21 +387,41 @@ class Project:
         return LiveRun(plan, is_shown=options.show)
 
     def _load(self) -> LoadedProject:
-        return load_with_messages(self._path, override_texts(self.settings))[0]
+        return load_with_messages(self._source, override_texts(self.settings))[0]
 
-    def _load_for_run(self, options: StartOptions) -> tuple[Described, Messages]:
+    def _load_for_run(
+        self, options: StartOptions, *, is_held: bool = False
+    ) -> tuple[Described, Messages]:
         texts = [*override_texts(self.settings), *override_texts(options.set)]
         names = (options.namespace, options.remap)
-        loaded, messages = load_with_messages(self._path, texts, *names)
+        loaded, messages = load_with_messages(self._source, texts, *names)
         if options.seed is not None:
             texts += [
                 f"nodes.{node}.environment.{name}={value}"
                 for node, variables in seed_variables(loaded.project, options.seed).items()
                 for name, value in variables.items()
             ]
-            loaded, messages = load_with_messages(self._path, texts, *names)
-        for warning in loaded.warnings:
-            if warning not in self._warned:
-                self._warned.add(warning)
-                warnings.warn(str(warning), stacklevel=3)
+            loaded, messages = load_with_messages(self._source, texts, *names)
+        self._warn(loaded, is_held=is_held)
         return loaded.project, messages
+
+    def _warn(self, loaded: LoadedProject, *, is_held: bool) -> None:
+        """Tell of new possible mistakes, where code outside of NeuROS has called it.
+
+        Args:
+            is_held: leaves out ports without a connection, which a session may use.
+        """
+        known = self._warned | (loaded.unconnected if is_held else frozenset())
+        frame, level, own = sys._getframe(), 1, own_packages()
+        while frame.f_back and str(frame.f_globals.get("__name__")).partition(".")[0] in own:
+            frame, level = frame.f_back, level + 1
+        for warning in loaded.warnings:
+            if warning not in known:
+                self._warned.add(warning)
+                warnings.warn(str(warning), stacklevel=level)
+
+
+def _project_of(source: Path | PythonProject, settings: Mapping[str, Any]) -> Project:
+    project = Project.__new__(Project)
+    project._open(source, settings)
+    return project

@@ -10,6 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.api.kept import kept_value
 from neuros.api.run_record import PastRun, open_run, run_table
 from neuros.errors import RunError
 from neuros.project.scanner import read_bytes
@@ -61,7 +62,8 @@ class Run(PastRun):
     @property
     def exit_code(self) -> int:
         """0 normal end; 1 a node failed or was killed, a deadlock, or loss on a lossless
-        connection; 4 a record was not written; 5 a budget was broken; 130 Ctrl+C; 143 SIGTERM.
+        connection; 4 a record was not written; 5 a budget was broken; 7 the program
+        that held it failed; 130 Ctrl+C; 143 SIGTERM.
         """
         return int(self.record["exit_code"])
 
@@ -116,6 +118,14 @@ class Run(PastRun):
         from neuros.bag import open_bag
 
         return open_bag(self.folder)
+
+    def kept(self, value: str) -> Any:
+        """What a node has kept with ``node.keep``, by its name: ``run.kept("brain.weights")``.
+
+        Raises:
+            UsageError: if the run has kept nothing of that name.
+        """
+        return kept_value(self.folder, value)
 
     def log(self, node: str) -> str:
         """The log and output of a node.

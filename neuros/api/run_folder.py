@@ -8,6 +8,8 @@
         launcher.log               stacks that are too long for the console
         <node>/node.json           project, connections and settings of the node
         <node>/node.log            its output and log
+        <node>/kept/               what its plugin keeps, restored/: what was restored to it
+        <node>/plugin/             the plugin file, if a program gave functions
         <node>/...                 files that its plugin wrote to node.run_dir
 """
 
@@ -20,14 +22,16 @@ import os
 import platform
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.api.kept import copy_sources
 from neuros.api.plan import Plan
+from neuros.api.plugin_text import PluginText
 from neuros.api.run_record import EXIT_ENVIRONMENT
 from neuros.backends.reaper import Reaper
 from neuros.backends.sidecars import Recorded, RecorderProcess
@@ -96,32 +100,61 @@ def removed_folders(files: Sequence[NodeFile], run_folder: Path) -> list[str]:
     ]
 
 
-def write_node_files(plan: Plan, run_folder: Path) -> list[NodeFile]:
-    """Write the expanded project and one ``node.json`` per node.
+def write_node_files(
+    plan: Plan, run_folder: Path, *, keeps_functions: bool = False
+) -> tuple[Plan, list[NodeFile]]:
+    """Write the expanded project, and for each node ``node.json`` and a plugin of functions.
+
+    Args:
+        keeps_functions: whether the nodes are in this program, and call the functions themselves.
+
+    Returns:
+        The plan with the files of these plugins, and the node files.
 
     Raises:
-        UsageError: if the folder cannot be written to, or another run has begun there.
+        UsageError: if the folder cannot be written to, another run has begun there, or a function
+            cannot stand in a file.
     """
+    of_functions = [node for node in plan.nodes if node.hooks and not keeps_functions]
+    texts = {node.name: PluginText(node.name, node.hooks) for node in of_functions}
+    plugins = {name: run_folder / name / "plugin" / f"{name}_plugin.py" for name in texts}
+    nodes = (
+        replace(node, plugin=plugins[node.name], hooks=()) if node.name in plugins else node
+        for node in plan.project.nodes
+    )
+    plan = replace(plan, project=replace(plan.project, nodes=tuple(nodes)))
     files = plan.node_files(folders_of(plan, run_folder))
-    try:
-        # Mode x: of two runs that were given the same empty folder, only one gets it.
-        with open(run_folder / "project.json", "x", encoding="utf-8") as expanded:
-            expanded.write(json.dumps(project_to_json(plan.project), indent=2) + "\n")
+    with faults_of(run_folder):
+        try:
+            # Of two runs that were given the same empty folder, only one gets it.
+            (run_folder / "project.json").touch(exist_ok=False)
+        except FileExistsError as error:
+            raise UsageError(
+                f"{run_folder}: another run has just begun there; name a new one"
+            ) from error
+        expanded = json.dumps(project_to_json(plan.project), indent=2) + "\n"
+        (run_folder / "project.json").write_text(expanded, "utf-8")
+        for name, text in texts.items():
+            text.write(plugins[name])
         for file in files:
             (run_folder / file.node.name).mkdir(exist_ok=True)
             path = run_folder / file.node.name / "node.json"
             seen = plan.deployment.as_seen(file)
             path.touch(0o600)  # it holds the environment, which others must not read
             path.write_text(node_file_text(seen), "utf-8")
-    except FileExistsError as error:
-        raise UsageError(
-            f"{run_folder}: another run has just begun there; name a new one"
-        ) from error
+        copy_sources(plan.restored, run_folder)
+    return plan, files
+
+
+@contextlib.contextmanager
+def faults_of(run_folder: Path) -> Iterator[None]:
+    """Raise ``UsageError`` where a run folder cannot be written to."""
+    try:
+        yield
     except OSError as error:
         raise UsageError(
             f"{run_folder} cannot be written to ({error.strerror}): name another folder with -o"
         ) from error
-    return files
 
 
 def save_record(record: dict[str, Any], ended: Outcome, folder: Path, run_id: str) -> None:
@@ -159,12 +192,8 @@ class Recording:
     ) -> None:
         self._plan = replace(plan, custom={**plan.custom, "run_id": run_id})
         self._run = run
-        try:
+        with faults_of(run):
             self._plan.save(run)
-        except OSError as error:
-            raise UsageError(
-                f"{run} cannot be written to ({error.strerror}): name another folder with -o"
-            ) from error
         command = python_command("neuros.cli", "recorder", str(run))
         self._process = RecorderProcess(command, run, log_of(run), environment)
         reaper.watch(self._process.pid)

@@ -36,8 +36,6 @@ from neuros.project.scanner import display_name, place_of, read_bytes
 from neuros.project.suggest import did_you_mean
 from neuros.transport.messages import RosPackets
 
-PROGRAM_FAILED = 1
-"""The exit code of a run whose program has failed."""
 _CONNECT_S = 0.01
 _Answer = TypeVar("_Answer")
 
@@ -96,11 +94,14 @@ class HeldRun(Protocol):
     def size_of(self, content: Any) -> int:
         """The bytes of the content of a packet."""
 
-    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def reset(
+        self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
+    ) -> bool:
         """Bring all nodes back to their start, paused; ``False`` if they cannot be, or have ended.
 
         Args:
             variables: of their environments that change, by node.
+            keep: names of the values of their plugins that survive, by node.
         """
 
     def look(self) -> Sequence[NodeStatus] | None:
@@ -196,11 +197,13 @@ class LaunchedRun:
     def size_of(self, content: bytes) -> int:
         return len(content)
 
-    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def reset(
+        self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
+    ) -> bool:
         # A round that was given up may go on for ever: it ends as a free run does.
         if (self.run_for(0.0, {}) if self.is_behind else self.advance(0, {})) is None:
             return False
-        self._send(Reset(variables))
+        self._send(Reset(variables, {node: tuple(names) for node, names in keep.items()}))
         answer = self._answer(WasReset, lambda _: True, None)
         return answer is not None and not answer.why_not
 
@@ -221,7 +224,7 @@ class LaunchedRun:
         self._live.stop(reason)
 
     def interrupt(self, reason: str, exit_code: int) -> None:
-        self._live.interrupt()
+        self._live.fail(reason, exit_code)
 
     def wait(self) -> Run:
         if self._run is None:
@@ -353,11 +356,5 @@ def port_of(project: Project, name: str, *, is_input: bool) -> tuple[Node, Port]
 def declared_at(node: Node) -> str:
     """Where a node is declared, for messages."""
     line, column = place_of(node.file, node.pointer)
-    return f"node '{node.name}' is declared in {display_name(node.file)}:{line}:{column}"
-
-
-def why_it_ended(error: BaseException) -> tuple[str, int]:
-    """The reason and the exit code of a run whose program fails."""
-    if isinstance(error, KeyboardInterrupt):
-        return "ended by Ctrl+C", 130
-    return f"the program failed: {type(error).__name__}: {error}", PROGRAM_FAILED
+    place = f":{line}:{column}" if line else ""
+    return f"node '{node.name}' is declared in {display_name(node.file)}{place}"

@@ -367,16 +367,16 @@ def _topics_of(folder: Path) -> list[_Topic]:
         for c in file.connections:
             name = f"{c.topic}/data"
             if c.source_node == node.name:
-                kind = node.output(c.source_output).type
+                kind = node.output(c.source_output).ros_type
                 found.append(_Topic(name, kind, str(c), node.name, c.source_output))
             else:
-                found.append(_Topic(name, node.input(c.destination_input).type, str(c)))
+                found.append(_Topic(name, node.input(c.destination_input).ros_type, str(c)))
         ports = [(p, p.external_topic) for p in node.inputs]
         ports += [(p, p.name) for p in node.outputs]
         for port, sampled in ports:
             if port.external_topic is not None:
                 name = file.names.resolve(port.external_topic, node.name)
-                found.append(_Topic(name, port.type, "", node.name, sampled or ""))
+                found.append(_Topic(name, port.ros_type, "", node.name, sampled or ""))
         return found
     except OSError as error:
         raise EnvironmentFault(

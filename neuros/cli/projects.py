@@ -145,7 +145,7 @@ def _types(options: argparse.Namespace) -> int:
     ports = [port for node in project.nodes for port in (*node.inputs, *node.outputs)]
     folder = Path(options.output or "typings")
     try:
-        files = write_stubs({port.type for port in ports}, folder)
+        files = write_stubs({port.ros_type for port in ports}, folder)
     except OSError as error:
         raise UsageError(f"{folder}: cannot be written ({error.strerror})") from error
     print(f"{folder}: {counted(len(files), 'package')} of messages")

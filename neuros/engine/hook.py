@@ -192,6 +192,8 @@ class Hook:
             packets = (None,) * len(results)
         else:
             packets = result if isinstance(result, _SEVERAL) else (result,)
+        if len(packets) != len(results) == 1 and self.outputs[0].port.array:
+            raise self._no_packet(self.outputs[0], result)
         if len(packets) != len(results):
             names = ", ".join(output.port.name for output in self.outputs)
             raise self.error(
@@ -212,10 +214,7 @@ class Hook:
                 found.append((output, packet))
                 continue
             if not isinstance(packet, wanted.kind):
-                raise self.error(
-                    f"returned {_kind(packet)} for output '{output.port.name}', which carries"
-                    f' {output.port.type}: use node.make_packet("{output.port.name}")'
-                )
+                raise self._no_packet(output, packet)
             try:
                 found.append((output, wanted.check(packet)))
             except WrongValue as error:
@@ -226,6 +225,15 @@ class Hook:
     def error(self, text: str) -> HookError:
         """A ``HookError`` with the name and line of this hook."""
         return HookError(text, hook=self.name, where=self.spec.where)
+
+    def _no_packet(self, output: Output, found: object) -> HookError:
+        """The error for something that is no packet of an output."""
+        port = output.port
+        make = f", or numpy.asarray(values, '{port.array.dtype}')" if port.array else ""
+        return self.error(
+            f"returned {_kind(found)} for output '{port.name}', which carries {port.type}:"
+            f' use node.make_packet("{port.name}"){make}'
+        )
 
     def _update_candidates(self) -> None:
         if self._is_enabled and self._is_due and not self._lacking:

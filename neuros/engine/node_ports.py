@@ -31,7 +31,7 @@ class Links(Protocol):
 
 
 class PacketType(NamedTuple):
-    """The message class of an output, and its check.
+    """The class of the packets of an output, and their check.
 
     Attributes:
         check: returns a packet with the values to be sent, or raises ``WrongValue``.

@@ -48,7 +48,8 @@ class Outcome:
 
     Attributes:
         exit_code: 0 ended normally, 1 a node failed or deadlock, 4 the engine went away or what
-            should have been recorded could not be, 5 a budget was broken, 130 and 143 by signal.
+            should have been recorded could not be, 5 a budget was broken, 7 the program that had
+            started it failed, 130 and 143 by signal.
         reason: one line for the user.
         reports: the last report of every node that made one.
         report_times_s: when that was, on the monotonic clock.

@@ -56,8 +56,8 @@ class Supervisor:
         output: for log records; its ``poll`` shows what nodes have logged.
         signals: numbers of the signals that have arrived, appended to by a signal handler.
         listener: where nodes and observers connect to the control channel.
-        wishes: reasons for which this program wants the run to end, drained; appended to by any
-            thread.
+        wishes: with a reason and an exit code, this program wants the run to end: drained if the
+            code is 0, else as failed; appended to by any thread.
         duration_s: wall time from time 0 to a drained end, ``None``: no limit.
         finalise_s: how long nodes may finalise without progress, ``None``: as their files say.
         peers: who starts the other nodes of the project, where not all are started here.
@@ -84,7 +84,7 @@ class Supervisor:
         signals: list[int],
         *,
         listener: ControlListener,
-        wishes: Sequence[str] = (),
+        wishes: list[tuple[str, int]] | None = None,
         duration_s: float | None = None,
         finalise_s: float | None = None,
         peers: Peers | None = None,
@@ -96,7 +96,7 @@ class Supervisor:
         self._launcher = launcher
         self._environment = {**environment, control.CONTROL_VARIABLE: listener.address}
         self._output = output = Overheard(output, lambda message: self.observers.tell(message))
-        self._wishes = wishes
+        self._wishes = [] if wishes is None else wishes
         self._duration_s = duration_s
         self._paused_before_s = 0.0  # time 0 of the run
         self._peers = peers or Peers("", (), files)
@@ -165,6 +165,7 @@ class Supervisor:
             while self._processes and not self._shutdown.is_hopeless:
                 self._channels.wait(min(self._pause_s(has_shown), self._settling.wait_s))
                 self._shutdown.heed_signals()
+                self._heed_program()
                 self._hear()
                 self._look_at_processes()
                 self._look_at_time()
@@ -182,6 +183,15 @@ class Supervisor:
         return self.outcome
 
     # ------------------------------------------------------------------ what arrives
+
+    def _heed_program(self) -> None:
+        """End as the program that has started the run wishes."""
+        while self._wishes:
+            reason, exit_code = self._wishes.pop(0)
+            if not exit_code:
+                self._shutdown.drain(reason, DRAIN_S)
+            elif self._shutdown.phase in (Phase.RUNNING, Phase.DRAINING):
+                self._shutdown.fail(reason, exit_code)
 
     def _hear(self) -> None:
         for link, message in self._channels.receive():
@@ -365,9 +375,6 @@ class Supervisor:
             outcome.ending_s = self.pause.since_s
 
     def _look_at_run(self, now_s: float) -> None:
-        if self._wishes:
-            self._shutdown.drain(self._wishes[0], DRAIN_S)
-            return
         if self.pause.is_on:
             self._detector.begin_anew(now_s)
             self._backlog.begin_anew()

@@ -76,7 +76,7 @@ class Messages:
     def of_nodes(cls, nodes: Iterable[Node], workspaces: Workspaces) -> Messages:
         """The packages that nodes need: all of the project, and shared ones that ports name."""
         ports = (port for node in nodes for port in (*node.inputs, *node.outputs))
-        used = {port.type.partition("/")[0] for port in ports}
+        used = {port.ros_type.partition("/")[0] for port in ports}
         # The shared workspace is not searched if all packages come with ROS, as they mostly do.
         names = used if any(find_spec(package) is None for package in used) else ()
         return cls(workspaces, {*workspaces.own, *names})

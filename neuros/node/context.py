@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -62,6 +63,19 @@ class Context:
         return file.startswith(self.project) and not file.startswith(_SHARED)
 
 
+class _Imported:
+    """Gives a node a module that the process has imported already."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self._module = module
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return self._module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """It has run."""
+
+
 class ContextSwitch:
     """Puts the context of one node at a time in place.
 
@@ -72,8 +86,10 @@ class ContextSwitch:
         self._process = Context({}, os.environ._data, sys.path)  # type: ignore[attr-defined]
         self._current = self._process
         self._known_modules = len(sys.modules)
+        # A library that the program has imported itself belongs to none of the nodes yet.
+        self._process.modules |= {n: sys.modules[n] for n in _FOR_ONE_NODE if n in sys.modules}
         self._owners: dict[str, Context] = {}
-        self._before = {name for name in _FOR_ONE_NODE if name in sys.modules}
+        sys.meta_path.insert(0, self)
         # By the contexts before and after a switch, the variables in which nodes differ.
         self._differing: dict[tuple[Context, Context], list[Any]] = {}
 
@@ -83,6 +99,8 @@ class ContextSwitch:
         plugin: Path | None,
         project: Path,
         log_file: Path | None = None,
+        *,
+        shares_modules: bool = False,
     ) -> Context:
         """The context for a node.
 
@@ -92,18 +110,23 @@ class ContextSwitch:
                 of an installed package, which is found as it is.
             project: modules from below this folder are private to the node.
             log_file: where its standard output and error go, ``None`` to leave them.
+            shares_modules: whether the plugin is functions of the program: no module of that is
+                hidden from them.
         """
         log_fd = None
         if log_file is not None:
             log_file.parent.mkdir(parents=True, exist_ok=True)
             log_fd = os.open(log_file, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
-        return Context(
+        context = Context(
             environment,
             self._environ_with(environment),
             [*([str(plugin.parent)] if plugin else []), *self._process.path],
             str(project) + os.sep,
             log_fd,
         )
+        if shares_modules:
+            context.modules = self._process.modules
+        return context
 
     def enter(self, context: Context) -> None:
         """Put ``context`` in place."""
@@ -140,17 +163,6 @@ class ContextSwitch:
         if self in sys.meta_path:
             sys.meta_path.remove(self)
 
-    def claim(self, name: str) -> None:
-        """Let a library be of the node whose context is in place, if it has been imported.
-
-        One that the process has had before is nobody's else.
-        """
-        if name in sys.modules and name not in self._owners:
-            self._owners[name] = context = self._current
-            context.modules[name] = self._process.modules[name] = sys.modules[name]
-            if self not in sys.meta_path:
-                sys.meta_path.insert(0, self)
-
     def why_bound(self, context: Context) -> str:
         """Which library holds state of this node outside of its modules; empty if none does."""
         names = [name for name, owner in self._owners.items() if owner is context]
@@ -183,23 +195,26 @@ class ContextSwitch:
             environ[os.environ.encodekey(key)] = os.environ.encodevalue(value)
         return environ
 
-    def find_spec(self, name: str, *_: object) -> None:
+    def find_spec(self, name: str, *_: object) -> ModuleSpec | None:
         """Part of the import system: refuse a library that another node has for itself."""
-        owner = self._owners.get(name)
-        if owner is not None and self._current not in (owner, self._process):
+        if name not in _FOR_ONE_NODE or self._current is self._process:
+            return None
+        if self._owners.setdefault(name, self._current) is not self._current:
             raise ImportError(
                 f"{_FOR_ONE_NODE[name]}, and another node of this process uses it: run the project"
                 " with --backend process"
             )
+        module = self._process.modules.get(name)
+        return None if module is None else ModuleSpec(name, _Imported(module))  # type: ignore[arg-type]
 
     def _find_modules(self, context: Context) -> None:
         """Note which modules of the process are private to a node."""
         for name, module in tuple(sys.modules.items()):
             if context.hides(module):
                 context.modules[name] = module
-        if context is not self._process:
-            for name in _FOR_ONE_NODE.keys() - self._before:
-                self.claim(name)
+        for name, owner in self._owners.items():
+            if name in sys.modules and context is owner:
+                context.modules[name] = self._process.modules[name] = sys.modules[name]
 
     def _set_variables(self, old: Context, new: Context) -> None:
         """Let C libraries see the variables that differ (``getenv``)."""

@@ -95,6 +95,21 @@ class _Request:
         return found
 
 
+class _ArrayMessage:
+    """An array as the message that it is in ROS, without its layout.
+
+    Attributes:
+        data: its numbers, row by row.
+    """
+
+    def __init__(self, packet: Any) -> None:
+        self.data = packet.reshape(-1)
+
+    @staticmethod
+    def get_fields_and_field_types() -> Sequence[str]:
+        return ("data",)
+
+
 class Sampler:
     """Looks at packets for observers.
 
@@ -114,8 +129,12 @@ class Sampler:
         """Look at the packets there while they are asked for."""
         if tap.way is not Way.RECEIVED:
             port = tap.port.external_topic if tap.way is Way.HEARD else tap.port.name
-            name = str(port)
-            self._taps.append((name, tap, lambda packet, _: self.note(name, packet)))
+            name, is_array = str(port), tap.port.array is not None
+
+            def observe(packet: Any, _: bytes | None) -> None:
+                self.note(name, _ArrayMessage(packet) if is_array else packet)
+
+            self._taps.append((name, tap, observe))
 
     def note(self, port: str, packet: Any) -> None:
         """A packet passes. The thread of the hooks only."""

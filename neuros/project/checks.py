@@ -21,7 +21,7 @@ from neuros.project.message_types import normalised
 from neuros.project.model import Connection, Node
 from neuros.project.names import INTERNAL, MOST_CHARACTERS
 from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
-from neuros.project.plugin_files import PluginHook, Remark, read_plugin
+from neuros.project.plugin_files import PluginHook, Remark, plugins_of, read_plugin
 from neuros.project.scanner import Element
 from neuros.project.suggest import did_you_mean
 from neuros.project.validate import MOST_PROBLEMS
@@ -63,8 +63,8 @@ def mistakes(parsed: ParsedProject) -> list[Problem]:
 
 
 def remarks(parsed: ParsedProject) -> list[Problem]:
-    """Possible mistakes in a project without mistakes."""
-    return sorted([*_gazebo_remarks(parsed), *_port_remarks(parsed)])
+    """Possible mistakes in a project without mistakes, but for :func:`unconnected_ports`."""
+    return [*_gazebo_remarks(parsed), *_qos_remarks(parsed)]
 
 
 def _ports_of(node: Element) -> Iterator[tuple[Element, Side]]:
@@ -201,8 +201,8 @@ def _compression(connection: Element, types: list[str]) -> Iterator[Problem]:
         )
 
 
-def _port_remarks(parsed: ParsedProject) -> Iterator[Problem]:
-    """Ports that nothing is connected to, and QoS without effect."""
+def unconnected_ports(parsed: ParsedProject) -> Iterator[Problem]:
+    """Ports that nothing is connected to."""
     used = {
         (side, connection.string(node), connection.string(port))
         for connection in parsed.connections
@@ -210,13 +210,20 @@ def _port_remarks(parsed: ParsedProject) -> Iterator[Problem]:
     }
     for node in parsed.nodes:
         for port, side in _ports_of(node):
-            name, qos = port.string("name"), port.member("qos")
+            name = port.string("name")
             # The plugin may read a sensor itself, for a message of the user's own.
             is_sensor = side == "outputs" and port.member("mujoco") is not None
             is_used = (side, node.string("name"), name) in used
             if not (is_used or is_sensor or port.member("external_topic")):
                 text = f"{side[:-1]} '{name}' of node '{node.string('name')}' is not connected"
                 yield port.problem(text)
+
+
+def _qos_remarks(parsed: ParsedProject) -> Iterator[Problem]:
+    """QoS without effect."""
+    for node in parsed.nodes:
+        for port, _ in _ports_of(node):
+            qos = port.member("qos")
             policies = qos and (qos.string("reliability"), qos.string("durability"))
             if qos is not None and policies == ("best_effort", "transient_local"):
                 yield qos.problem(
@@ -228,9 +235,7 @@ def _port_remarks(parsed: ParsedProject) -> Iterator[Problem]:
 
 def _where(element: Element, key: str = "") -> str:
     """The place of an element, or of its key, as a hint."""
-    place = element.value[key] if key else element
-    line, column = place.source.place(place.start)
-    return f"see {place.source.name}:{line}:{column}"
+    return f"see {(element.value[key] if key else element).where}"
 
 
 # ---------------------------------------------------------------------- ROS graph
@@ -360,16 +365,14 @@ def plugin_problems(
     """
     problems, doubts = list[Problem](), list[Problem]()
     for node, element in zip(nodes, parsed.nodes, strict=True):
-        plugin = read_plugin(node.plugin) if node.plugin != Path() else None
-        if plugin is None:
-            continue
-        found = [*plugin.mistakes]
-        lists = (getattr(element.member(side), "value", []) for side in ("inputs", "outputs"))
-        if all(isinstance(each, list) for each in lists):
-            for hook in plugin.hooks:
-                found += _misfits(hook, node, connections)
-        problems += [remark.in_file(plugin.path) for remark in found]
-        doubts += [remark.in_file(plugin.path) for remark in plugin.doubts]
+        for plugin in plugins_of(node):
+            found = [*plugin.mistakes]
+            lists = (getattr(element.member(side), "value", []) for side in ("inputs", "outputs"))
+            if all(isinstance(each, list) for each in lists):
+                for hook in plugin.hooks:
+                    found += _misfits(hook, node, connections)
+            problems += [remark.in_file(plugin.path) for remark in found]
+            doubts += [remark.in_file(plugin.path) for remark in plugin.doubts]
     return problems, doubts
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from neuros.errors import Problem
-from neuros.project.message_types import misfit, normalised
+from neuros.project.message_types import misfit, normalised, ros_type
 from neuros.project.parsed import ParsedProject
 from neuros.project.scanner import Element
 from neuros.project.suggest import did_you_mean, listed
@@ -88,7 +88,9 @@ def _types(parsed: ParsedProject) -> dict[str, str]:
                 name = port.string("name") if side == "outputs" else port.string("external_topic")
                 if name is not None:
                     written = port.string("type") or ""
-                    found[f"{node.string('name')}.{name}"] = normalised(written) or written
+                    found[f"{node.string('name')}.{name}"] = ros_type(
+                        normalised(written) or written
+                    )
     return found
 
 

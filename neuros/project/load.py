@@ -14,10 +14,18 @@ from neuros.project.checks import (
     mistakes,
     plugin_problems,
     remarks,
+    unconnected_ports,
     unread_variables,
 )
 from neuros.project.dashboard import dashboard_of
-from neuros.project.message_types import NO_PACKAGES, MessagePackages, normalised, unknown_type
+from neuros.project.in_python import FILE, PythonProject
+from neuros.project.message_types import (
+    NO_PACKAGES,
+    MessagePackages,
+    normalised,
+    unknown_type,
+    wrong_array,
+)
 from neuros.project.model import (
     FINALISE_S,
     NETWORK,
@@ -42,6 +50,7 @@ from neuros.project.parsed import (
     parse_project,
 )
 from neuros.project.paths import PathError, Roots, find_module, is_module_name, why_no_module
+from neuros.project.plugin_files import file_of
 from neuros.project.qos import qos_of
 from neuros.project.scanner import Element, SourceError, display_name
 from neuros.project.suggest import did_you_mean
@@ -68,6 +77,7 @@ class _Builder:
 
     def __init__(self, parsed: ParsedProject) -> None:
         self._roots = parsed.roots
+        self._functions = parsed.functions
         self.problems: list[Problem] = []
 
     def node(self, element: Element) -> Node:
@@ -94,7 +104,8 @@ class _Builder:
                 environment[name] = str(found or "")
                 paths.append(name)
         keys, cores = element.plain, (core.value for core in element.items("affinity"))
-        module, plugin = self._plugin(element)
+        hooks = self._hooks(element)
+        module, plugin = ("", file_of(hooks)) if hooks else self._plugin(element)
         if element.member("network") is not None:
             module, plugin = NETWORK_MODULE, find_module(NETWORK_MODULE) or Path()
             environment[NETWORK] = str(self._file(element, "network") or "")
@@ -116,7 +127,13 @@ class _Builder:
             parameters=_if_valid(lambda: parameters_of(keys.get("parameters", {})), {}),
             module=module,
             finalise_s=_if_valid(lambda: float(keys.get("finalise_s", FINALISE_S)), FINALISE_S),
+            hooks=hooks,
         )
+
+    def _hooks(self, element: Element) -> tuple[Callable[..., Any], ...]:
+        """The functions of a node in Python, unless ``--set`` has given it another plugin."""
+        plugin = element.member("plugin")
+        return next((functions for member, functions in self._functions if member is plugin), ())
 
     def _plugin(self, element: Element) -> tuple[str, Path]:
         """The module of the plugin, empty if a file has that name, and its file."""
@@ -163,8 +180,9 @@ class _Builder:
     def _port(self, element: Element, *, is_input: bool, must_be_here: bool) -> Port:
         written, keys = element.string("type") or "", element.plain
         type_name = normalised(written)
-        unknown = type_name and unknown_type(
-            type_name, must_be_here=must_be_here, packages=self._roots.packages
+        unknown = wrong_array(written) or (
+            type_name
+            and unknown_type(type_name, must_be_here=must_be_here, packages=self._roots.packages)
         )
         if unknown:
             self.problems.append(element.value["type"].problem(*unknown))
@@ -190,14 +208,20 @@ def _if_valid(read: Callable[[], _T], default: _T) -> _T:
 
 @dataclass(frozen=True)
 class LoadedProject:
-    """A valid project, and warnings of possible mistakes in it."""
+    """A valid project, and warnings of possible mistakes in it.
+
+    Attributes:
+        unconnected: those of the warnings that name a port without a connection; a session may read
+            such an output, and send to such an input.
+    """
 
     project: Project
     warnings: tuple[Problem, ...] = ()
+    unconnected: frozenset[Problem] = frozenset()
 
 
 def load_project(
-    path: Path,
+    path: Path | PythonProject,
     *,
     workspace: Path,
     overrides: Sequence[str] = (),
@@ -210,7 +234,7 @@ def load_project(
     """Load and check a project.
 
     Args:
-        path: the project file, or a folder that holds ``project.json``.
+        path: the project file, a folder that holds ``project.json``, or a project in Python.
         workspace: the second folder of ``@path``, after the project's own workspace.
         overrides: the texts of ``--set``, applied in this order.
         folder: the project's folder, if not that of the file: the expanded project of a run is in
@@ -223,12 +247,17 @@ def load_project(
     Raises:
         ProjectError: with all problems.
     """
-    file = path.resolve() / PROJECT_FILE if path.is_dir() else path.parent.resolve() / path.name
-    if problem := _no_project_at(path, file):
-        raise ProjectError([problem])
+    if isinstance(path, PythonProject):
+        file = path.folder / FILE
+    else:
+        file = path.resolve() / PROJECT_FILE if path.is_dir() else path.parent.resolve() / path.name
+        if problem := _no_project_at(path, file):
+            raise ProjectError([problem])
     roots = Roots((folder or file.parent).resolve(), workspace.resolve(), packages)
     try:
-        parsed = parse_project(file, roots)
+        parsed = (
+            path.parsed(roots) if isinstance(path, PythonProject) else parse_project(file, roots)
+        )
     except SourceError as error:
         raise ProjectError([error.problem]) from None
     for text in overrides:
@@ -267,7 +296,9 @@ def load_project(
         names=names,
         dashboard=dashboard_of(parsed),
     )
-    return LoadedProject(project, (*remarks(parsed), *doubts))
+    loose = [*unconnected_ports(parsed)]
+    told = (*sorted([*remarks(parsed), *loose]), *doubts)
+    return LoadedProject(project, told, frozenset(loose))
 
 
 def _no_project_at(path: Path, file: Path) -> Problem | None:
@@ -290,4 +321,4 @@ def _no_project_at(path: Path, file: Path) -> Problem | None:
 def _name(folder: Path, file: Path) -> str:
     """The project's name: that of the folder, with that of the file if it is a variant."""
     name = folder.name or "project"
-    return name if file.name == PROJECT_FILE else f"{name}-{file.stem}"
+    return name if file.name in (PROJECT_FILE, FILE) else f"{name}-{file.stem}"

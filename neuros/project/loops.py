@@ -14,7 +14,7 @@ from typing import NamedTuple, TypeVar
 
 from neuros.errors import Problem
 from neuros.project.model import Connection, Node, Project
-from neuros.project.plugin_files import PluginFile, PluginHook, PluginPort, read_plugin
+from neuros.project.plugin_files import PluginFile, PluginHook, PluginPort, plugins_of, read_plugin
 from neuros.project.scanner import display_name
 
 _Key = TypeVar("_Key", bound=Hashable)
@@ -187,20 +187,24 @@ class Loops:
 
 def _hooks_of(node: Node) -> Sequence[PluginHook] | None:
     """The hooks of a node; ``None`` if it may have others, or sends packets without hooks."""
-    plugin = None if node.plugin.name == "" else read_plugin(node.plugin)
-    if plugin is None or not plugin.is_whole or plugin.mistakes:
-        return None
-    beside = [*modules_beside(plugin)]
-    if any(part.sends_by_itself for part in (plugin, *beside)):
-        return None
-    bring_hooks = plugin.functions_of - {p.path.stem for p in beside if p.is_whole and not p.hooks}
-    is_known = all(None not in (hook.inputs, hook.outputs) for hook in plugin.hooks)
+    found: list[PluginHook] = []
+    for plugin in plugins_of(node):
+        if not plugin.is_whole or plugin.mistakes:
+            return None
+        beside = [*modules_beside(plugin)]
+        if any(part.sends_by_itself for part in (plugin, *beside)):
+            return None
+        without_hooks = {part.path.stem for part in beside if part.is_whole and not part.hooks}
+        if plugin.functions_of - without_hooks:
+            return None
+        found += plugin.hooks
+    is_known = all(None not in (hook.inputs, hook.outputs) for hook in found)
     has_names = all(
         port.name is not None
-        for hook in plugin.hooks
+        for hook in found
         for port in (*(hook.inputs or ()), *(hook.outputs or ()))
     )
-    return plugin.hooks if is_known and has_names and not bring_hooks else None
+    return found if found and is_known and has_names else None
 
 
 def modules_beside(plugin: PluginFile) -> Iterator[PluginFile]:

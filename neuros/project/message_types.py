@@ -1,4 +1,4 @@
-"""Message types: their notation, and whether they exist on this machine.
+"""Types of ports: messages and arrays, their notation, and whether they exist on this machine.
 
 The import of a message package takes tens of milliseconds. So a message is searched among the names
 that ``msg/__init__.py`` of its package imports. The package is imported only if the name is not
@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import math
 import re
 import sys
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from neuros.project.suggest import did_you_mean, listed
 
+_SHORT = re.compile(r"\A([A-Za-z]\w*)/([A-Za-z]\w*)\Z", re.ASCII)
 _NOTATION = re.compile(r"([A-Za-z]\w*)(?:\.msg\.|/msg/)([A-Za-z]\w*)", re.ASCII)
 _TEXTS = ("string", "wstring", "byte", "octet", "wchar")
 _IMPORTED = re.compile(r"^\s*from\s+\S+\s+import\s+(\w+)", re.MULTILINE)
@@ -78,10 +81,116 @@ class NoPackages:
 NO_PACKAGES = NoPackages()
 
 
+# ---------------------------------------------------------------------- arrays
+
+_ARRAY = re.compile(r"(\w+) ?\[(.*)\]", re.ASCII)
+_SHAPE = re.compile(r"[0-9]{1,10}( *, *[0-9]{1,10})*", re.ASCII)
+_MOST_ARRAY_BYTES = 2**31 - 1  # the lengths and strides of a MultiArray have 32 bits
+_ITEM_BYTES = {"bool": 1} | {
+    f"{kind}{size}": size // 8
+    for kind, sizes in (("int", (8, 16, 32, 64)), ("uint", (8, 16, 32, 64)), ("float", (32, 64)))
+    for size in sizes
+}
+_OTHER_DTYPES = {
+    **dict.fromkeys(("float", "double", "f8", "longdouble", "float96", "float128"), "float64"),
+    **dict.fromkeys(("single", "f4", "half", "f2", "float16"), "float32"),
+    **dict.fromkeys(("int", "i8", "long", "intp"), "int64"),
+    **dict.fromkeys(("byte", "char", "u1"), "uint8"),
+    **dict.fromkeys(("bool_", "boolean"), "bool"),
+}
+"""Other names of numbers, and those that no ROS message holds, with the type to write instead."""
+
+
+class ArrayType(NamedTuple):
+    """The type of a port whose packets are NumPy arrays, ``float64[18]``.
+
+    Attributes:
+        dtype: of NumPy, by its name: a bool, integer or float that ROS has a message for.
+        shape: at least one dimension, each at least 1.
+    """
+
+    dtype: str
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """How many elements an array has."""
+        return math.prod(self.shape)
+
+    @property
+    def nbytes(self) -> int:
+        """The bytes of an array."""
+        return self.size * _ITEM_BYTES[self.dtype]
+
+    @property
+    def message(self) -> str:
+        """The ROS message that an array is wherever it leaves NeuROS, ROS having no array of bool.
+
+        Its ``layout`` has the shape.
+        """
+        kind = "UInt8" if self.dtype == "bool" else self.dtype.capitalize().replace("Uint", "UInt")
+        return f"std_msgs/msg/{kind}MultiArray"
+
+    def __str__(self) -> str:
+        return f"{self.dtype}[{','.join(map(str, self.shape))}]"
+
+
+@cache
+def array_type(type_name: str) -> ArrayType | None:
+    """The array type of that name; ``None`` if it is the name of a message, or wrong."""
+    match = _ARRAY.fullmatch(type_name)
+    if match is None or wrong_array(type_name):
+        return None
+    return ArrayType(match[1], tuple(map(int, match[2].split(","))))
+
+
+def ros_type(type_name: str) -> str:
+    """The message type by which ROS knows the packets of a port of this type."""
+    array = array_type(type_name)
+    return type_name if array is None else array.message
+
+
+def wrong_array(text: str) -> tuple[str, str] | None:
+    """The problem with what looks like an array type, and a hint; ``None`` if there is none."""
+    match = _ARRAY.fullmatch(text)
+    if match is None:
+        return None
+    dtype, shape = match.groups()
+    if dtype not in _ITEM_BYTES:
+        instead = _OTHER_DTYPES.get(dtype)
+        hint = f"write {instead}[{shape}]" if instead else did_you_mean(dtype, _ITEM_BYTES)
+        has = f"an array holds {listed(_ITEM_BYTES)}"
+        return f"'{text}': no ROS message holds an array of '{dtype}'", hint or has
+    if not _SHAPE.fullmatch(shape):
+        hint = f"write whole numbers, as in {dtype}[18] or {dtype}[480,640,3]"
+        if not shape.strip():
+            return f"'{text}': an array has a fixed shape", hint
+        return f"'{text}': '{shape}' is not the shape of an array", hint
+    found = ArrayType(dtype, tuple(map(int, shape.split(","))))
+    if not found.size:
+        return f"'{text}': each dimension is at least 1", ""
+    if found.nbytes > _MOST_ARRAY_BYTES:
+        return f"'{text}': an array has at most {_MOST_ARRAY_BYTES} bytes, not {found.nbytes}", ""
+    return None
+
+
+# ---------------------------------------------------------------------- messages
+
+
 def normalised(text: str) -> str | None:
-    """``std_msgs/msg/String`` for that or ``std_msgs.msg.String``, ``None`` for anything else."""
+    """The one name of a type, ``None`` if it is none.
+
+    ``std_msgs/msg/String`` for that or ``std_msgs.msg.String``, ``uint8[4,3]`` for ``uint8[4, 3]``.
+    """
+    if (array := array_type(text)) is not None:
+        return str(array)
     match = _NOTATION.fullmatch(text)
     return f"{match[1]}/msg/{match[2]}" if match else None
+
+
+def in_full(text: str) -> str:
+    """``std_msgs/msg/String`` for ``std_msgs/String``, as Python may write it."""
+    return _SHORT.sub(r"\1/msg/\2", text)
 
 
 def unknown_type(
@@ -93,7 +202,7 @@ def unknown_type(
         must_be_here: whether a package that is not installed on this machine is a problem.
         packages: of the project.
     """
-    package, _, name = type_name.split("/")
+    package, _, name = ros_type(type_name).split("/")
     folder = message_folder(package)
     own = packages.messages(package) if folder is None else None
     if own is not None:
@@ -199,7 +308,7 @@ def misfit(
     """
     if not _PATH.fullmatch(path):
         return f"'{path}' is not the path of a field", "write it as 'angular_velocity.z'"
-    here, done = MessageField(type_name, is_array=False), ""
+    here, done = MessageField(ros_type(type_name), is_array=False), ""
     for name, place in _STEP.findall(path):
         if place:
             if not here.is_array:

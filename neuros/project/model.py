@@ -7,12 +7,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
+from neuros.project.message_types import ArrayType, array_type, ros_type
 from neuros.project.names import INTERNAL, Names
 from neuros.project.qos import Qos
 
@@ -69,7 +70,7 @@ class Port:
 
     Attributes:
         name: unique among the inputs, or among the outputs, of its node.
-        type: message type in ROS notation, ``"std_msgs/msg/String"``.
+        type: message type in ROS notation, ``"std_msgs/msg/String"``, or ``"float64[18]"``.
         external_topic: the plain ROS topic that it is bound to, as written, or ``None``;
             :meth:`Names.resolve` tells its full name.
         qos: of the external topic, or ``None`` if the file has none.
@@ -84,6 +85,16 @@ class Port:
     gazebo_type: str | None = None
     qos: Qos | None = None
 
+    @property
+    def array(self) -> ArrayType | None:
+        """The type of its packets if they are NumPy arrays, ``None`` if they are messages."""
+        return array_type(self.type)
+
+    @property
+    def ros_type(self) -> str:
+        """The type of its packets on the ROS graph and in bags."""
+        return ros_type(self.type)
+
 
 @dataclass(frozen=True)
 class Node:
@@ -91,7 +102,7 @@ class Node:
 
     Attributes:
         plugin: absolute path of the Python file with the hooks; ``Path()`` for a module that is
-            not installed on this machine.
+            not installed on this machine. Of ``hooks``: the file of the first one, if it has any.
         script: absolute path of a shell script that runs before the node, or ``None``.
         environment: environment variables, with ``#path`` and ``@path`` already resolved.
         file: the file that describes the node, for messages.
@@ -103,6 +114,7 @@ class Node:
         parameters: values of ROS parameters, by full name.
         module: the plugin as a module of an installed package, else empty.
         finalise_s: seconds of finalisation without progress after which the node is killed.
+        hooks: functions of this program that are the plugin; empty if it is a file. JSON has none.
     """
 
     name: str
@@ -121,6 +133,7 @@ class Node:
     parameters: Mapping[str, Value] = field(default_factory=lambda: _NOTHING, hash=False)
     module: str = ""
     finalise_s: float = FINALISE_S
+    hooks: tuple[Callable[..., Any], ...] = ()
 
     def input(self, name: str) -> Port:
         """The input of that name; raises ``KeyError``."""
@@ -133,6 +146,8 @@ class Node:
     @property
     def plugin_name(self) -> str:
         """The name of the plugin, or of the network in its place, for messages."""
+        if self.hooks:
+            return ", ".join(getattr(hook, "__name__", repr(hook)) for hook in self.hooks)
         if self.module == NETWORK_MODULE:
             return Path(self.environment.get(NETWORK, "")).name
         return self.module or self.plugin.name
@@ -261,6 +276,7 @@ class NodeFile:
         messages: for ``sys.path``, the folder ``python`` of each built message package.
         names: the project's.
         list_bytes: limit of each list of the packet log; 0: the node keeps no log.
+        restored: by name of a value that its plugin keeps, the file that it came from.
     """
 
     node: Node
@@ -270,6 +286,12 @@ class NodeFile:
     messages: tuple[Path, ...] = ()
     names: Names = _NO_NAMES
     list_bytes: int = 64_000_000
+    restored: Mapping[str, str] = field(default_factory=lambda: _NOTHING, hash=False)
+
+    @property
+    def logger_name(self) -> str:
+        """The name of its logger in ROS, which rcl makes from namespace and name."""
+        return f"{self.names.namespace}/{self.node.name}"[1:].replace("/", ".")
 
 
 @dataclass(frozen=True)

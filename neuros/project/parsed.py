@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from neuros.errors import Problem
 from neuros.project.names import Names, names_from
@@ -62,6 +62,7 @@ class ParsedProject:
         entries: for each node, the entry of the project file that leads to it.
         is_complete: whether every entry of ``nodes`` could be read.
         problems: of reading.
+        functions: of nodes in Python, in place of the file that their key ``plugin`` names.
     """
 
     root: Element
@@ -70,6 +71,7 @@ class ParsedProject:
     entries: list[Element] = field(default_factory=list)
     is_complete: bool = True
     problems: list[Problem] = field(default_factory=list)
+    functions: list[tuple[Element, tuple[Callable[..., Any], ...]]] = field(default_factory=list)
 
     @property
     def connections(self) -> list[Element]:

@@ -11,9 +11,10 @@ import ast
 import inspect
 import re
 import sys
+import textwrap
 import threading
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +22,8 @@ from typing import Any, TypeAlias
 
 import neuros.hooks
 from neuros.errors import Problem
-from neuros.hooks import InputSpec, input_of, output_of, period_of
+from neuros.hooks import HookSpec, InputSpec, hook_specs_of, input_of, output_of, period_of
+from neuros.project.model import Node
 from neuros.project.scanner import display_name, read_bytes
 from neuros.project.suggest import did_you_mean
 
@@ -135,6 +137,42 @@ class PluginFile:
     is_whole: bool = False
     functions_of: frozenset[str] = frozenset()
     sends_by_itself: bool = False
+
+
+def plugins_of(node: Node) -> list[PluginFile]:
+    """The declarations of a node's plugin; of its functions, one for each file they are in.
+
+    Empty if the plugin cannot be read.
+    """
+    if node.hooks:
+        return read_functions(node.hooks)
+    plugin = None if node.plugin == Path() else read_plugin(node.plugin)
+    return [] if plugin is None else [plugin]
+
+
+def file_of(functions: Sequence[Callable[..., Any]]) -> Path:
+    """The file of the first of the functions, which need not exist: they may be of a notebook."""
+    return next((plugin.path for plugin in read_functions(functions)), Path())
+
+
+def read_functions(functions: Sequence[Callable[..., Any]]) -> list[PluginFile]:
+    """The declarations of functions of this program, one for each file that they are in."""
+    found: dict[str, PluginFile] = {}
+    for spec in hook_specs_of(dict(enumerate(functions))):
+        file, _, line = spec.where.rpartition(":")
+        plugin = found.setdefault(file, PluginFile(Path(file), is_whole=True))
+        place = int(line) if file else 1, 1
+        plugin.hooks.append(
+            PluginHook(
+                spec.name,
+                tuple(PluginPort(p.name, *place, p.is_all, p.is_optional) for p in spec.inputs),
+                tuple(PluginPort(p.name, *place, False, p.is_optional) for p in spec.outputs),
+                None if spec.sim_period_s is None else place,
+                f"neuros_{spec.kind.value}",
+            )
+        )
+        _Reader.check_source(plugin, spec)
+    return [*found.values()]
 
 
 def read_plugin(path: Path) -> PluginFile | None:
@@ -341,14 +379,36 @@ class _Reader:
             if is_plain and hook.inputs is not None:
                 self._check_signature(function, hook.inputs)
         if is_plain and kinds:
-            who = f"hook '{function.name}'"
-            if isinstance(function, ast.AsyncFunctionDef):
-                hint = "only callbacks of ROS may be coroutines"
-                self._mistake(function, f"{who} is a coroutine, and would never run", hint)
-            elif any(isinstance(node, ast.Yield | ast.YieldFrom) for node in _own_nodes(function)):
-                text = f"{who} has 'yield', and would never run"
-                self._mistake(function, text, "a hook returns its packets")
+            self._check_kind(function)
         return any(kind in _ARGUMENTS for kind in kinds)
+
+    def _check_kind(self, function: _Function) -> None:
+        """Whether a call of the function runs it."""
+        who = f"hook '{function.name}'"
+        if isinstance(function, ast.AsyncFunctionDef):
+            hint = "only callbacks of ROS may be coroutines"
+            self._mistake(function, f"{who} is a coroutine, and would never run", hint)
+        elif any(isinstance(node, ast.Yield | ast.YieldFrom) for node in _own_nodes(function)):
+            text = f"{who} has 'yield', and would never run"
+            self._mistake(function, text, "a hook returns its packets")
+
+    @classmethod
+    def check_source(cls, plugin: PluginFile, spec: HookSpec) -> None:
+        """Check the source of a function of this program, if Python has kept it."""
+        try:
+            lines, first = inspect.getsourcelines(spec.function)
+            with _PARSING:
+                tree = ast.parse(textwrap.dedent("".join(lines)))
+        except (OSError, TypeError, SyntaxError):  # of a shell, or in the middle of an expression
+            plugin.is_whole = False  # it may send from a thread
+            return
+        ast.increment_lineno(tree, first - 1)
+        reader, (function, *_) = cls(plugin, tree), tree.body
+        if isinstance(function, _FUNCTIONS) and not hasattr(spec.function, "__wrapped__"):
+            reader._check_signature(function, plugin.hooks[-1].inputs or ())
+            reader._check_kind(function)
+        attributes = (each for each in reader._nodes if isinstance(each, ast.Attribute))
+        plugin.sends_by_itself |= any(each.attr in _SENDERS for each in attributes)
 
     def _hook(self, function: _Function, decorator: ast.expr, kind: str) -> PluginHook:
         unknown = PluginHook(function.name, None, None, kind=kind)

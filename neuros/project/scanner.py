@@ -36,26 +36,31 @@ class Source:
         name: for messages.
         folder: of relative paths in the text.
         file: that holds the text; ``Path()`` for the value of an option.
+        has_lines: whether messages show line and column: the user has not written the JSON of an
+            object of Python.
     """
 
     name: str
     folder: Path
     text: str
     file: Path = Path()
+    has_lines: bool = True
 
     @cached_property
     def _line_starts(self) -> list[int]:
         return [0, *(match.end() for match in re.finditer("\n", self.text))]
 
     def place(self, position: int) -> tuple[int, int]:
-        """Line and column of a position, both from 1."""
+        """Line and column of a position, both from 1; (0, 0) if the source has no lines."""
+        if not self.has_lines:
+            return 0, 0
         line = bisect_right(self._line_starts, position)
         return line, position - self._line_starts[line - 1] + 1
 
     def problem(self, position: int, pointer: str, text: str, hint: str = "") -> Problem:
-        """A problem at a position; the whole document is shown as ``/``."""
+        """A problem at a position; the whole document of a file is shown as ``/``."""
         line, column = self.place(position)
-        return Problem(self.name, line, column, pointer or "/", text, hint)
+        return Problem(self.name, line, column, pointer or "/" * self.has_lines, text, hint)
 
 
 @dataclass
@@ -121,6 +126,12 @@ class Element:
             value = element.value
             element = value[int(step)] if isinstance(value, list) else value[step]
         return element
+
+    @property
+    def where(self) -> str:
+        """The place of the value, for messages about another one."""
+        line, column = self.source.place(self.start)
+        return f"{self.source.name}:{f'{line}:{column}' if line else f' {self.pointer}'}"
 
     def problem(self, text: str, hint: str = "") -> Problem:
         """A problem with the value."""
@@ -285,11 +296,17 @@ class _Scanner:
             hint = "JSON has no comments"
         elif rest[0] == "'":
             hint = "JSON has double quotes only"
-        raise SourceError(self._source.problem(position, pointer, f"syntax error: {text}", hint))
+        what = f"syntax error: {text}" if self._source.has_lines else text
+        raise SourceError(self._source.problem(position, pointer, what, hint))
 
 
 def place_of(file: Path, pointer: str) -> tuple[int, int]:
-    """Line and column of a pointer in a file; (1, 1) if the file has changed since."""
+    """Line and column of a pointer in a file; (1, 1) if the file has changed since.
+
+    (0, 0) if there is no such file: the project is one of Python objects.
+    """
+    if not file.exists():
+        return 0, 0
     try:
         root, _ = read_file(file)
         parts = (part.replace("~1", "/").replace("~0", "~") for part in pointer.split("/")[1:])

@@ -11,6 +11,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
+from math import prod
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -30,6 +31,7 @@ _NUMBERS = {
     "uint16": "<u2", "int32": "<i4", "uint32": "<u4", "int64": "<i8", "uint64": "<u8",
     "float32": "<f4", "float64": "<f8",
 }  # fmt: skip
+_MULTI_ARRAY_LAYOUT = "std_msgs/msg/MultiArrayLayout"
 _EMPTY = "structure_needs_at_least_one_member"
 _BASE, _NAME, _ARRAY = 1, 2, 3
 _MOST_LAYOUTS = 64
@@ -61,6 +63,7 @@ class _Layout:
         numbers: name, NumPy type (with its shape) and place of each number or row of numbers.
         texts: name, place and length of each string.
         lengths: places of the lengths of strings and sequences.
+        sizes: name and dimensions of each layout of a ``MultiArray``; its numbers have that shape.
 
     Raises:
         _Irregular: if the message has no layout.
@@ -72,6 +75,8 @@ class _Layout:
         self.numbers: list[tuple[str, np.dtype[Any], int]] = []
         self.texts: list[tuple[str, int, int]] = []
         self.lengths: list[int] = []
+        self.sizes: list[tuple[str, npt.NDArray[np.int64]]] = []
+        self._shape: tuple[int, ...] = ()
         self._data = data
         self._types = types
         self._at = len(_CDR_HEADER)
@@ -87,6 +92,8 @@ class _Layout:
                 self._at += size
             elif kind.value == _BASE:
                 self._number(f"{prefix}{name}", details[0], ())
+            elif kind.value == _NAME and details == _MULTI_ARRAY_LAYOUT:
+                self._layout(f"{prefix}{name}.")
             elif kind.value == _NAME:
                 self._message(details, f"{prefix}{name}.")
             elif kind.value == _ARRAY:
@@ -94,10 +101,25 @@ class _Layout:
             else:
                 self._row(f"{prefix}{name}", details[0], self._length(), is_array=False)
 
+    def _layout(self, prefix: str) -> None:
+        """The dimensions of the numbers that follow: messages with others have other columns."""
+        shape = []
+        for _ in range(self._length()):
+            label_bytes = self._length()
+            self._at += label_bytes
+            shape.append(self._length())
+            self._length()  # its stride
+            if self._at > len(self._data):
+                raise _Irregular
+        self._shape = tuple(shape)
+        self.sizes.append((f"{prefix}dim", np.array(shape, np.int64)))
+        self._number(f"{prefix}data_offset", "uint32", ())
+
     def _row(self, name: str, element: Any, count: int, *, is_array: bool) -> None:
         kind, details = element[0].value, element[1]
+        shape, self._shape = self._shape, ()
         if kind == _BASE and details[0] in _NUMBERS:
-            self._number(name, details[0], (count,))
+            self._number(name, details[0], shape if shape and prod(shape) == count else (count,))
         elif count == 0:
             self._number(name, "uint8", (0,))
         elif kind == _NAME and is_array:
@@ -134,8 +156,8 @@ class _Layout:
 
     def columns(self, table: Column) -> dict[str, Column]:
         """A column for each number and string of contiguous rows of bytes."""
-        columns: dict[str, Column] = {}
         count, size = table.shape
+        columns: dict[str, Column] = {n: np.tile(sizes, (count, 1)) for n, sizes in self.sizes}
         for name, kind, place in self.numbers:
             if kind.itemsize:
                 parts: Any = {"names": ["x"], "formats": [kind], "offsets": [place]}
@@ -157,7 +179,8 @@ def columns_of(packets: Sequence[bytes], type_name: str, store: Typestore) -> di
 
     Fields of messages within the message have names with dots, ``header.stamp.sec``. The column of
     an array of numbers has more than one dimension, as has that of sequences of one length. Strings
-    are ``str``. Other fields (sequences of different length, or of messages) are objects.
+    are ``str``. Other fields (sequences of different length, or of messages) are objects. The
+    numbers of a ``MultiArray`` have the shape of its layout, whose ``dim`` is its sizes.
     """
     if not packets:
         try:  # the layout of a message whose strings and sequences are empty

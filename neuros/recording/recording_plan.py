@@ -217,7 +217,7 @@ def _candidates(project: Project, names: Collection[str]) -> Iterator[_Candidate
         source, destination = connection.source_node, connection.destination_node
         topic = Topic(
             f"{connection.topic}/data",
-            project.node(source).output(connection.source_output).type,
+            project.node(source).output(connection.source_output).ros_type,
             connection.is_reliable,
             connection.window,
             str(connection),
@@ -241,7 +241,7 @@ def _candidates(project: Project, names: Collection[str]) -> Iterator[_Candidate
             qos = port.qos or (OFFERED if is_output else ASKED)
             topic = Topic(
                 name,
-                port.type,
+                port.ros_type,
                 qos.reliability != "best_effort" if is_output else qos.reliability == "reliable",
                 qos.depth or DEPTH,
                 is_latched=qos.is_latched,

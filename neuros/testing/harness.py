@@ -28,11 +28,14 @@ from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.node.context import ContextSwitch
 from neuros.node.handle import NodeHandle
+from neuros.node.keeping import restore_values
 from neuros.node.node import NodeRuntime
 from neuros.node.plugin import no_module
+from neuros.project.in_python import Plugin, functions_of, plugin_key
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
 from neuros.project.paths import find_module, is_module_name
+from neuros.project.plugin_files import file_of
 from neuros.runtime.local import Record
 from neuros.testing.stand_ins import (
     ManualClock,
@@ -44,7 +47,7 @@ from neuros.testing.stand_ins import (
     with_observer,
 )
 from neuros.transport.memory import MemoryHub
-from neuros.transport.messages import checked, copy_packet, message_class
+from neuros.transport.messages import checked, copy_packet, make_packet
 
 _MANY = 10_000
 """Hook executions after which :meth:`PluginHarness.run` assumes that they never end."""
@@ -89,7 +92,7 @@ class Neighbours:
             self._started[connection] = position
             if connection.is_reliable:
                 node = self._hub.inboxes[connection.source_node]
-                self._hub.post(partial(node.on_acknowledgement, connection, position))
+                self._hub.loop.post(partial(node.on_acknowledgement, connection, position))
 
     # ------------------------------------------------------------------ inbox
 
@@ -115,7 +118,7 @@ class Neighbours:
         while waiting and not window.is_blocked:
             window.spend(0)
             node = self._hub.inboxes[connection.destination_node]
-            self._hub.post(partial(node.on_packet, connection, waiting.popleft()))
+            self._hub.loop.post(partial(node.on_packet, connection, waiting.popleft()))
 
 
 class PluginHarness:
@@ -174,21 +177,24 @@ class PluginHarness:
         shutdown_reason: the argument of the plugin's ``node.shutdown``, ``None`` before.
 
     Args:
-        plugin: the plugin file, or the name of an installed module.
+        plugin: the plugin file, the name of an installed module, or functions with a decorator of
+            :mod:`neuros.hooks`, one or a list; they run as they are, in this program.
         inputs, outputs: message type by name of the port.
         connections: those that differ, ``wire("camera.image -> node.view", discard_limit=3)``.
         environment: environment variables of the node.
         name: the node's name.
         run_folder: the run folder, a temporary one if not given.
+        restore: values that the plugin gets back by ``node.keep``, by name.
 
     Raises:
         PluginError, HookError: if the plugin cannot be imported, or declares its hooks wrongly.
         ValueError: if a connection does not fit the ports.
+        UsageError: if a function has no such decorator.
     """
 
     def __init__(
         self,
-        plugin: str | os.PathLike[str],
+        plugin: Plugin,
         *,
         inputs: Mapping[str, str] | None = None,
         outputs: Mapping[str, str] | None = None,
@@ -196,13 +202,19 @@ class PluginHarness:
         environment: Mapping[str, str] | None = None,
         name: str = "node",
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> None:
-        path, module = Path(plugin).resolve(), ""
-        if not path.exists() and is_module_name(os.fspath(plugin)):
-            module = os.fspath(plugin)
-            if (found := find_module(module)) is None:
-                raise no_module(module)
-            path = found
+        hooks, module = functions_of(plugin), ""
+        if hooks:
+            path = file_of(hooks)
+        else:
+            written = plugin_key(plugin) or ""
+            path = Path(written).resolve()
+            if not path.exists() and is_module_name(written):
+                module = written
+                if (found := find_module(module)) is None:
+                    raise no_module(module)
+                path = found
         node = Node(
             name=name,
             container="neuros_python",
@@ -212,9 +224,11 @@ class PluginHarness:
             environment=dict(environment or {}),
             file=path,
             module=module,
+            hooks=hooks,
         )
         wires = with_neighbours(node, connections)
-        self._open(node, wires, path.parent, WORKSPACE, run_folder)
+        project = path.parent if path.exists() else Path.cwd()
+        self._open(node, wires, project, WORKSPACE, run_folder, restore)
 
     @classmethod
     def from_project(
@@ -226,6 +240,7 @@ class PluginHarness:
         overrides: Sequence[str] = (),
         workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> PluginHarness:
         """A node of a project, with its connections in that project.
 
@@ -247,7 +262,8 @@ class PluginHarness:
         node = _with_environment(loaded.node(node_name), environment)
         own = [c for c in loaded.connections if node_name in (c.source_node, c.destination_node)]
         harness = cls.__new__(cls)
-        harness._open(node, with_observer(node, own), loaded.folder, workspace, run_folder)
+        wires = with_observer(node, own)
+        harness._open(node, wires, loaded.folder, workspace, run_folder, restore)
         return harness
 
     @classmethod
@@ -259,6 +275,7 @@ class PluginHarness:
         environment: Mapping[str, str] | None = None,
         workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> PluginHarness:
         """The node that a node file describes; each port has a connection, as in the constructor.
 
@@ -276,7 +293,7 @@ class PluginHarness:
         node = _with_environment(loaded.nodes[0], environment)
         harness = cls.__new__(cls)
         wires = with_neighbours(node, connections)
-        harness._open(node, wires, file.parent, workspace, run_folder)
+        harness._open(node, wires, file.parent, workspace, run_folder, restore)
         return harness
 
     def _open(
@@ -286,6 +303,7 @@ class PluginHarness:
         project: Path,
         workspace: Path,
         run_folder: Path | None,
+        restore: Mapping[str, Any] | None,
     ) -> None:
         if run_folder is None:
             folder = Path(tempfile.mkdtemp(prefix="neuros-"))
@@ -294,7 +312,8 @@ class PluginHarness:
             folder = run_folder.resolve()
         messages = provide_messages(node, workspaces_of(project, workspace))
         folders = Folders(project, workspace, folder)
-        file = NodeFile(node, connections, folders, messages=messages)
+        restored = restore_values(restore or {}, folder / node.name)
+        file = NodeFile(node, connections, folders, messages=messages, restored=restored)
         self.log: list[Record] = []
         self.shutdown_reason: str | None = None
         self._file = file
@@ -393,6 +412,12 @@ class PluginHarness:
         return self._runtime.run_dir
 
     @property
+    def kept(self) -> dict[str, Any]:
+        """What the plugin keeps (``node.keep``), by name: its values of now."""
+        with self._in_context():
+            return self._runtime.keeping.values()
+
+    @property
     def time_s(self) -> float:
         """Seconds advanced by :meth:`advance`."""
         return self._clock.now_ns / 1e9
@@ -425,8 +450,8 @@ class PluginHarness:
     # ------------------------------------------------------------------ what goes in
 
     def make_packet(self, port: str) -> Any:
-        """A new message of the type of an input (or else an output), with default values."""
-        return message_class(self._port(port, "port", self._inputs | self._outputs).type)()
+        """A new packet for an input (or else an output): default values, an array of zeros."""
+        return make_packet(self._port(port, "port", self._inputs | self._outputs).type)
 
     def send(self, input_name: str, *packets: Any, source: str | None = None) -> None:
         """Send packets to an input; packets that its connection does not let through yet wait.

@@ -8,11 +8,10 @@ from types import MappingProxyType
 from typing import Any
 
 from neuros.errors import NodeError
-from neuros.ports import Inbox
-from neuros.project.message_types import normalised
+from neuros.ports import Inbox, Logger
+from neuros.project.message_types import in_full, normalised, wrong_array
 from neuros.project.model import Connection, Node, NodeFile, Port, Value
 from neuros.runtime.local import (
-    LocalLogger,
     LocalLoop,
     LocalMiddleware,
     LocalRosNode,
@@ -57,7 +56,7 @@ class RosNodeStandIn(LocalRosNode):
     def __init__(
         self,
         name: str,
-        logger: LocalLogger,
+        logger: Logger,
         parameters: Mapping[str, Value] = _NOTHING,
         topics: Mapping[str, tuple[str, int, int]] = MappingProxyType({}),
     ) -> None:
@@ -124,7 +123,7 @@ class Workbench(LocalMiddleware):
         super().__init__(loop, write, _raise)
         self._topics = topics
 
-    def local_ros_node(self, file: NodeFile, logger: LocalLogger) -> LocalRosNode:
+    def local_ros_node(self, file: NodeFile, logger: Logger) -> LocalRosNode:
         node = file.node
         return RosNodeStandIn(node.name, logger, node.parameters, _topics_of(file))
 
@@ -143,12 +142,12 @@ def _topics_of(file: NodeFile) -> dict[str, tuple[str, int, int]]:
     for c in file.connections:
         is_output = c.source_node == node.name
         port = node.output(c.source_output) if is_output else node.input(c.destination_input)
-        found[f"{c.topic}/data"] = (port.type, 1, 1)
+        found[f"{c.topic}/data"] = (port.ros_type, 1, 1)
     for is_output, ports in ((True, node.outputs), (False, node.inputs)):
         for port in ports:
             if port.external_topic is not None:
                 name = file.names.resolve(port.external_topic, node.name)
-                found[name] = (port.type, int(is_output), int(not is_output))
+                found[name] = (port.ros_type, int(is_output), int(not is_output))
     return found
 
 
@@ -178,11 +177,13 @@ def ports(types: Mapping[str, str]) -> tuple[Port, ...]:
     """Ports from their names and message types, in either notation."""
     found = []
     for name, written in types.items():
-        type_name = normalised(written)
+        type_name = normalised(in_full(written))
         if type_name is None:
-            raise ValueError(
-                f"'{name}': {written!r} is not a message type: write it like 'std_msgs/msg/String'"
+            text, hint = wrong_array(written) or (
+                f"{written!r} is not a message type",
+                "write it like 'std_msgs/msg/String'",
             )
+            raise ValueError(f"'{name}': {text}{hint and f': {hint}'}")
         found.append(Port(name, type_name))
     return tuple(found)
 

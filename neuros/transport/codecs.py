@@ -21,6 +21,7 @@ import struct
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
+from math import prod
 from operator import attrgetter
 from typing import Any, Protocol, TypeAlias
 
@@ -28,14 +29,17 @@ import numpy
 from rclpy.serialization import deserialize_message, serialize_message
 
 from neuros.errors import ProtocolError
+from neuros.project.message_types import ArrayType
 from neuros.transport.schema import Leaf, Shape, Sort, Type, schema
 
 
 class WrongBytes(ProtocolError):
-    """Bytes that are no message of the type of their topic."""
+    """Bytes that are no packet of the type of their topic."""
 
-    def __init__(self, kind: type, data: bytes, why: object) -> None:
-        name = f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
+    def __init__(self, kind: type | ArrayType, data: bytes, why: object) -> None:
+        name = str(kind)
+        if isinstance(kind, type):
+            name = f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
         super().__init__(f"{len(data)} bytes are not a {name}: {why}")
 
 
@@ -117,9 +121,89 @@ class CdrCodec(MessageCodec):
             raise WrongBytes(self._kind, data, error) from error
 
 
+class ArrayCodec:
+    """Arrays of one type as messages of ``std_msgs``: all have the same bytes before the numbers.
+
+    A message of another program may name its dimensions, or leave the layout out.
+
+    Attributes:
+        rest: the message without its numbers.
+    """
+
+    def __init__(self, kind: ArrayType) -> None:
+        from std_msgs import msg
+
+        message = getattr(msg, kind.message.rpartition("/")[2])
+        self._kind, self._plain = kind, message_codec(message)
+        self._dtype, self._is_bool = numpy.dtype(kind.dtype), kind.dtype == "bool"
+        example = message()
+        for place, size in enumerate(kind.shape):
+            dimension = msg.MultiArrayDimension(size=size, stride=prod(kind.shape[place:]))
+            example.layout.dim.append(dimension)
+        self.rest = self._plain.encode(example)
+        code = "B" if self._is_bool else self._dtype.char
+        self.typecode = next(c for c in "bBhHiIqQfd" if numpy.dtype(c) == numpy.dtype(code))
+        example.data = array(self.typecode, bytes(self._dtype.itemsize))
+        first = self._plain.encode(example)
+        self._prefix = (
+            self.rest[: -_LENGTH.size]
+            + _LENGTH.pack(kind.size)
+            + first[len(self.rest) : -self._dtype.itemsize]
+        )
+        self._end = len(self._prefix) + kind.nbytes
+
+    def encode(self, packet: Any) -> bytes:
+        """The serialised message."""
+        data: bytes = self._prefix + packet.tobytes()
+        return data
+
+    def decode(self, data: bytes) -> Any:
+        """A read-only array."""
+        # DDS pads a message to a multiple of four bytes.
+        if data.startswith(self._prefix) and 0 <= len(data) - self._end < 4:
+            return self.of_numbers(data, len(self._prefix))
+        message = self._plain.decode(data)
+        if (why := self._misfit(message)) is not None:
+            raise WrongBytes(self._kind, data, why)
+        return self.of_numbers(message.data, 0)
+
+    def of_numbers(self, data: Any, start: int) -> Any:
+        """The array with these bytes from ``start`` on, without a copy where they are aligned."""
+        found: Any = numpy.ndarray(self._kind.shape, self._dtype, data, start)
+        if self._is_bool and (found.view(numpy.uint8) > 1).any():
+            raise WrongBytes(self._kind, data, "it has numbers other than 0 and 1")
+        if not found.flags.aligned:
+            found = found.copy()
+        found.flags.writeable = False
+        return found
+
+    def _misfit(self, message: Any) -> str | None:
+        """Why a message holds no array of the type; ``None`` if it does."""
+        shape, dimensions = self._kind.shape, message.layout.dim
+        sizes = tuple(each.size for each in dimensions)
+        strides = [each.stride for each in dimensions]
+        if sizes and sizes != shape:
+            return f"its layout is {','.join(map(str, sizes))}"
+        if any(strides) and strides != [prod(shape[place:]) for place in range(len(shape))]:
+            return f"its strides are {','.join(map(str, strides))}, not those of C"
+        if message.layout.data_offset:
+            return f"its numbers begin at {message.layout.data_offset}, not at 0"
+        if len(message.data) != self._kind.size:
+            return f"it has {len(message.data)} numbers"
+        return None
+
+
 @cache
-def message_codec(kind: type) -> Codec:
-    """The plain codec for a message class."""
+def array_codec(kind: ArrayType) -> ArrayCodec:
+    """The codec for the arrays of a type."""
+    return ArrayCodec(kind)
+
+
+@cache
+def message_codec(kind: Any) -> Codec:
+    """The plain codec for a message class, or for the arrays of a type."""
+    if isinstance(kind, ArrayType):
+        return array_codec(kind)
     try:
         return CdrCodec(kind, _parts_of(kind))
     except Unusual:

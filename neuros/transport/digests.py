@@ -19,7 +19,8 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 from neuros.project.model import Connection
 from neuros.transport.codecs import message_codec
 from neuros.transport.large_packets import LARGE_BYTES, is_parcel, message_of
-from neuros.transport.message_buffers import MessageBuffers, message_buffers
+from neuros.transport.message_buffers import Buffers, message_buffers
+from neuros.transport.messages import kind_of
 
 Digest: TypeAlias = Callable[[bytes, Any], int]
 """From the bytes that a packet travels as, and the packet, to its digest."""
@@ -37,20 +38,20 @@ def make_digests(connections: Sequence[Connection]) -> Digests:
 
 
 @cache
-def digest_for(kind: type) -> Digest:
-    """The digest function of a message class."""
+def digest_for(kind: Any) -> Digest:
+    """The digest function of a message class, or of an array type."""
     buffers = message_buffers(kind)
     if buffers is None:
         return digest_of_bytes
-    return _LargeDigest(kind, buffers)
+    return _LargeDigest(buffers)
 
 
 def digest_of(packet: Any) -> int:
     """The digest of a packet that does not travel as bytes."""
-    kind: Any = type(packet)
+    kind = kind_of(packet)
     buffers = message_buffers(kind)
     if buffers is not None and _size(buffers.views(packet)) >= LARGE_BYTES:
-        return _digest(message_codec(kind).encode(buffers.leave_out(packet)), buffers, packet)
+        return _digest(buffers.encode_rest(packet), buffers, packet)
     return digest_of_bytes(message_codec(kind).encode(packet))
 
 
@@ -102,8 +103,7 @@ class TriedDigest:
 class _LargeDigest:
     """Digests messages that can be large."""
 
-    def __init__(self, kind: type, buffers: MessageBuffers) -> None:
-        self._plain = message_codec(kind)
+    def __init__(self, buffers: Buffers) -> None:
         self._buffers = buffers
 
     def __call__(self, data: bytes, packet: Any) -> int:
@@ -111,8 +111,7 @@ class _LargeDigest:
             return _digest(message_of(data), self._buffers, packet)
         if len(data) < LARGE_BYTES or _size(self._buffers.views(packet)) < LARGE_BYTES:
             return digest_of_bytes(data)
-        rest = self._plain.encode(self._buffers.leave_out(packet))
-        return _digest(rest, self._buffers, packet)
+        return _digest(self._buffers.encode_rest(packet), self._buffers, packet)
 
 
 def digest_of_bytes(data: bytes, packet: Any = None) -> int:
@@ -124,7 +123,7 @@ def digest_of_bytes(data: bytes, packet: Any = None) -> int:
     return int(xxh3_64_intdigest(data + bytes(missing) if missing else data))
 
 
-def _digest(rest: bytes, buffers: MessageBuffers, packet: Any) -> int:
+def _digest(rest: bytes, buffers: Buffers, packet: Any) -> int:
     state = xxh3_64(rest)
     for view in buffers.views(packet):
         state.update(len(view).to_bytes(8, "little"))

@@ -29,13 +29,13 @@ from neuros.transport.codecs import PARCEL_MARK, Decoder, Encoder, message_codec
 from neuros.transport.message_buffers import (
     SHARED_MEMORY,
     BufferPlace,
-    MessageBuffers,
+    Buffers,
     Overwritten,
     SegmentReader,
     SegmentWriter,
     message_buffers,
 )
-from neuros.transport.messages import message_class
+from neuros.transport.messages import packet_kind
 
 LARGE_BYTES = 64 * 1024
 """Buffers of together this size or more leave the message: below, DDS is as fast."""
@@ -57,8 +57,8 @@ class LargeOutput:
 
     def __init__(
         self,
-        kind: type,
-        buffers: MessageBuffers,
+        kind: Any,
+        buffers: Buffers,
         *,
         owner: str,
         slots: int,
@@ -88,7 +88,7 @@ class LargeOutput:
             self._has_room = False
             self._warn(f"large packets of {self._owner} go through DDS, which is slower: {error}")
             return self._plain.encode(packet)
-        return _parcel(self._plain.encode(self._buffers.leave_out(packet)), place)
+        return _parcel(self._buffers.encode_rest(packet), place)
 
     def close(self) -> None:
         """Remove the shared memory."""
@@ -104,8 +104,8 @@ class LargeInput:
 
     def __init__(
         self,
-        kind: type,
-        buffers: MessageBuffers,
+        kind: Any,
+        buffers: Buffers,
         *,
         is_reliable: bool,
         folder: Path = SHARED_MEMORY,
@@ -138,9 +138,7 @@ class LargeInput:
             raise ProtocolError(f"a large packet cannot be read: {error}") from error
         if buffers is None:
             return None
-        packet = self._plain.decode(message)
-        self._buffers.put_back(packet, buffers)
-        return packet
+        return self._buffers.decode_with(message, buffers)
 
     def close(self) -> None:
         """Give up the shared memory."""
@@ -167,7 +165,7 @@ class LargeCodecs:
 
     def decoder(self, connection: Connection) -> Decoder:
         """The decoder of a connection to this node."""
-        kind = message_class(self._node.input(connection.destination_input).type)
+        kind = packet_kind(self._node.input(connection.destination_input).type)
         buffers = message_buffers(kind)
         if buffers is None:
             return message_codec(kind)
@@ -185,7 +183,7 @@ class LargeCodecs:
         """The encoder for a receiver that has sent ``note``; ``None``: :func:`message_codec`."""
         if not note or note != machine_token():
             return None
-        kind = message_class(self._node.output(connection.source_output).type)
+        kind = packet_kind(self._node.output(connection.source_output).type)
         buffers = message_buffers(kind)
         if buffers is None:
             return None

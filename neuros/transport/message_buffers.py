@@ -17,9 +17,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from neuros.errors import ProtocolError
+from neuros.project.message_types import ArrayType
+from neuros.transport.codecs import WrongBytes, array_codec, message_codec
 from neuros.transport.schema import Shape, getter, schema
 
 
@@ -71,6 +73,16 @@ class MessageBuffers:
             values[place] = array(typecode)
         return self._layout.make(values)
 
+    def encode_rest(self, packet: Any) -> bytes:
+        """A message with empty buffers, serialised."""
+        return message_codec(self._kind).encode(self.leave_out(packet))
+
+    def decode_with(self, rest: bytes, buffers: Sequence[array[Any]]) -> Any:
+        """The inverse of :meth:`encode_rest`, with these buffers. Raises ``WrongBytes``."""
+        packet = message_codec(self._kind).decode(rest)
+        self.put_back(packet, buffers)
+        return packet
+
     def put_back(self, packet: Any, buffers: Sequence[array[Any]]) -> None:
         """Give a message these buffers."""
         for (*path, slot), buffer in zip(self._paths, buffers, strict=True):
@@ -80,9 +92,45 @@ class MessageBuffers:
             setattr(holder, slot, buffer)
 
 
+class ArrayBuffers:
+    """The buffer of an array, in the place of :class:`MessageBuffers`: its numbers.
+
+    Attributes:
+        typecodes: what it holds, as ``array`` calls it.
+    """
+
+    def __init__(self, kind: ArrayType) -> None:
+        self._kind, self._codec = kind, array_codec(kind)
+        self.typecodes = (self._codec.typecode,)
+
+    def of(self, packet: Any) -> Sequence[Any]:
+        """The numbers, row by row."""
+        return [packet.reshape(-1)]
+
+    def views(self, packet: Any) -> Sequence[memoryview]:
+        """The bytes of the numbers."""
+        return [memoryview(packet.reshape(-1)).cast("B")]
+
+    def encode_rest(self, packet: Any) -> bytes:
+        """The message without its numbers, serialised."""
+        return self._codec.rest
+
+    def decode_with(self, rest: bytes, buffers: Sequence[array[Any]]) -> Any:
+        """The array of these numbers. Raises ``WrongBytes``."""
+        (numbers,) = buffers
+        if rest != self._codec.rest or len(numbers) != self._kind.size:
+            raise WrongBytes(self._kind, rest, f"{len(numbers)} numbers came beside them")
+        return self._codec.of_numbers(numbers, 0)
+
+
+Buffers: TypeAlias = "MessageBuffers | ArrayBuffers"
+
+
 @cache
-def message_buffers(kind: type) -> MessageBuffers | None:
-    """The buffers of a message class, ``None`` if it has none."""
+def message_buffers(kind: Any) -> Buffers | None:
+    """The buffers of a message class, ``None`` if it has none; or those of an array type."""
+    if isinstance(kind, ArrayType):
+        return ArrayBuffers(kind)
     buffers = MessageBuffers(kind)
     return buffers if buffers.fields else None
 

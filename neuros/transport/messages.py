@@ -1,4 +1,4 @@
-"""ROS messages: their classes by type name, new ones, copies, their check and their bytes.
+"""Packets, ROS messages or NumPy arrays: their kinds by type name, new ones, copies, bytes.
 
 A copy is equal to what a receiver of the packet's bytes gets.
 
@@ -24,6 +24,7 @@ import numpy
 from rclpy.type_support import check_for_type_support
 
 from neuros.errors import EnvironmentFault, WrongValue
+from neuros.project.message_types import ArrayType, array_type
 from neuros.project.model import Port
 from neuros.transport.codecs import message_codec
 from neuros.transport.imports_when_used import imports_when_used
@@ -35,12 +36,40 @@ _TYPE_NAME = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/msg/([A-Za-z][A-Za-z0-9_]*)")
 
 
 @cache
+def packet_kind(type_name: str) -> Any:
+    """What packets of a type are: a message class, or an :class:`ArrayType`.
+
+    Raises:
+        EnvironmentFault: as :func:`message_class`.
+    """
+    kind = message_class(type_name)
+    return array_type(type_name) or kind
+
+
+def kind_of(packet: Any) -> Any:
+    """What a packet is, as :func:`packet_kind` has it."""
+    kind = type(packet)
+    if hasattr(kind, "get_fields_and_field_types"):  # a message, which needs no NumPy
+        return kind
+    return _kind_of_array(packet.dtype, packet.shape)
+
+
+@cache
+def _kind_of_array(dtype: Any, shape: tuple[int, ...]) -> ArrayType:
+    return ArrayType(dtype.name, shape)
+
+
+@cache
 def message_class(type_name: str) -> type:
     """The class of a message type in ROS notation, ``"std_msgs/msg/String"``.
+
+    For the type of arrays it is that of the messages which ROS sees.
 
     Raises:
         EnvironmentFault: if its package is not installed or has no such message.
     """
+    if (array := array_type(type_name)) is not None:
+        return message_class(array.message)
     named = _TYPE_NAME.fullmatch(type_name)
     if named is None:
         raise EnvironmentFault(f"{type_name!r} is not a message type: write package/msg/Name")
@@ -78,11 +107,12 @@ def checked(port: Port, packet: Any) -> Any:
 
     Raises:
         TypeError: if it is of another type.
-        ValueError: if it holds a value that no node may send.
+        ValueError: if it holds a value that no node may send, or is an array of another type.
     """
-    kind = message_class(port.type)
-    if not isinstance(packet, kind):
-        raise TypeError(f"input '{port.name}' takes {port.type}, not {packet!r}")
+    kind = packet_kind(port.type)
+    if not isinstance(packet, RosPackets.packet_class(port.type)):
+        hint = f": make an array of it, numpy.asarray(values, '{kind.dtype}')" if port.array else ""
+        raise TypeError(f"input '{port.name}' takes {port.type}, not {packet!r}{hint}")
     try:
         return checker(kind)(packet)
     except WrongValue as error:
@@ -93,42 +123,61 @@ Copy: TypeAlias = Callable[[Any], Any]
 
 
 def make_packet(type_name: str) -> Any:
-    """A new message of a type in ROS notation, as its class without arguments would make it."""
-    return _factory(message_class(type_name))()
+    """A new packet of a type: a message as its class without arguments makes it, or zeros."""
+    return factory_of(type_name)()
+
+
+@cache
+def factory_of(type_name: str) -> Callable[[], Any]:
+    """The function that makes packets of a type."""
+    factory: Callable[[], Any] = _factory(packet_kind(type_name))
+    return factory
+
+
+@cache
+def copier_of(type_name: str) -> Copy:
+    """The function that copies packets of a type."""
+    copier: Copy = _copier(packet_kind(type_name))
+    return copier
+
+
+def encode_packet(packet: Any) -> bytes:
+    """A packet in the serialisation of ROS."""
+    return message_codec(kind_of(packet)).encode(packet)
 
 
 class RosPackets:
-    """What NeuROS does with ROS messages (:class:`neuros.ports.Packets`)."""
+    """What NeuROS does with packets (:class:`neuros.ports.Packets`)."""
 
     make = staticmethod(make_packet)
-    message_class = staticmethod(message_class)
+    encode = staticmethod(encode_packet)
+    copier = staticmethod(copier_of)
 
-    def checker(self, kind: type, *, for_jpeg: bool = False) -> Copy:
+    @staticmethod
+    def packet_class(type_name: str) -> type:
+        kind = packet_kind(type_name)
+        return numpy.ndarray if isinstance(kind, ArrayType) else cast(type, kind)
+
+    def checker(self, type_name: str, *, for_jpeg: bool = False) -> Copy:
         if for_jpeg:
             from neuros.transport.jpeg import jpeg_checker
 
             return jpeg_checker()
-        return checker(kind)
-
-    def copier(self, type_name: str) -> Copy:
-        return _copier(message_class(type_name))
-
-    def encode(self, packet: Any) -> bytes:
-        kind: type = type(packet)
-        return message_codec(kind).encode(packet)
+        return checker(packet_kind(type_name))
 
     def decode(self, type_name: str, data: bytes) -> Any:
-        return message_codec(message_class(type_name)).decode(data)
+        return message_codec(packet_kind(type_name)).decode(data)
 
 
 def copy_packet(packet: Any) -> Any:
-    """A message that shares nothing with ``packet``, which has been checked."""
-    kind: Any = type(packet)
-    return _copier(kind)(packet)
+    """A packet that shares nothing with ``packet``, which has been checked."""
+    return _copier(kind_of(packet))(packet)
 
 
 @cache
 def _factory(kind: Any) -> Callable[[], Any]:
+    if isinstance(kind, ArrayType):
+        return partial(numpy.zeros, kind.shape, kind.dtype)
     default = kind()
     values = [(slot, getattr(default, slot)) for slot in kind.__slots__]
     changeable = {
@@ -156,8 +205,17 @@ def _factory_of(field: Field) -> Callable[[Any], Callable[[], Any]]:
     return lambda value: partial(copy, value)
 
 
+def _copy_array(packet: Any) -> Any:
+    """A copy of an array, row by row, for its receivers: read-only."""
+    twin = packet.copy()
+    twin.flags.writeable = False
+    return twin
+
+
 @cache
 def _copier(kind: Any) -> Copy:
+    if isinstance(kind, ArrayType):
+        return _copy_array
     layout = schema(kind)
     changeable = tuple((f.slot, _copier_of(f)) for f in layout.fields if _can_change(f))
     names = tuple(f.slot for f in layout.fields if not _can_change(f))

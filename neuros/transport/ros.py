@@ -32,7 +32,7 @@ from neuros.transport.codecs import HEADER, PARCEL_MARK, Codec, Decoder, Encoder
 from neuros.transport.digests import Digest, digest_for, digest_of_bytes, make_digests
 from neuros.transport.envelope import Compressor, Traffic, compressing, decompressing
 from neuros.transport.large_packets import LargeCodecs, machine_token
-from neuros.transport.messages import message_class
+from neuros.transport.messages import message_class, packet_kind
 from neuros.transport.ros_graph import ExternalTopics, StrangerCheck, data_qos, is_compatible
 from neuros.transport.ros_loop import RosLoop
 
@@ -120,8 +120,8 @@ def _way(connection: Connection, port: Port, traffic: Traffic) -> tuple[type, Co
         from neuros.transport import jpeg  # brings all messages of cameras along
 
         return jpeg.KIND, jpeg.JpegCodec(connection.quality, traffic), digest_of_bytes
-    kind = message_class(port.type)
-    return kind, message_codec(kind), digest_for(kind)
+    kind = packet_kind(port.type)
+    return message_class(port.type), message_codec(kind), digest_for(kind)
 
 
 def position_of(data: bytes) -> int:

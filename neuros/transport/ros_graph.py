@@ -33,7 +33,7 @@ from neuros.project.model import Connection, NodeFile, Port
 from neuros.project.names import SESSION
 from neuros.project.qos import ASKED, OFFERED, PRESETS, Qos
 from neuros.transport.codecs import WrongBytes, message_codec
-from neuros.transport.messages import message_class
+from neuros.transport.messages import encode_packet, message_class, packet_kind
 from neuros.transport.ros_loop import RosLoop
 
 _QOS_POLL_S = 0.3
@@ -83,7 +83,7 @@ class ExternalTopics:
 
     def send(self, port: Port, packet: Any) -> None:
         if self._is_open:
-            self._publishers[port.name].publish(packet)
+            self._publishers[port.name].publish(encode_packet(packet))
 
     def close(self) -> None:
         """Publish and receive nothing any more; the endpoints go with their ROS node."""
@@ -92,7 +92,7 @@ class ExternalTopics:
     def _subscription(self, port: Port, topic: str, inbox: Inbox) -> Subscription:
         kind = message_class(port.type)
         profile = qos_profile(port.qos or ASKED)
-        decode = message_codec(kind).decode
+        decode = message_codec(packet_kind(port.type)).decode
         has_warned = False
 
         def receive(data: bytes) -> None:
@@ -158,7 +158,7 @@ class RosGraphBridge:
         """Publish a packet on data topics that have subscriptions."""
         for connection in connections:
             if connection in self.heard:
-                self._publishers[connection].publish(packet)
+                self._publishers[connection].publish(encode_packet(packet))
 
     def send_external(self, port: Port, packet: Any) -> None:
         self._external.send(port, packet)
@@ -384,8 +384,8 @@ def _reason(ros_node: RosNode, port: Port, subscription: Subscription) -> str:
     topic = subscription.topic_name
     listed = ros_node.get_publishers_info_by_topic(port.external_topic)
     types = {each.topic_type for each in listed}
-    if types - {port.type}:
-        return f"{topic} is published as {' and '.join(sorted(types))}, not as {port.type}"
+    if types - {port.ros_type}:
+        return f"{topic} is published as {' and '.join(sorted(types))}, not as {port.ros_type}"
     if types:
         if not any(is_compatible(each.qos_profile, subscription.qos_profile) for each in listed):
             return ""

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy
 
 from neuros.errors import WrongValue
+from neuros.project.message_types import ArrayType
 from neuros.transport.schema import Field, Shape, Sort, Type, getter, schema
 
 Check: TypeAlias = Callable[[Any], Any]
@@ -45,11 +46,13 @@ _REPR.maxother = 60
 
 @cache
 def checker(kind: Any) -> Check:
-    """The function that checks the messages of a class.
+    """The function that checks the messages of a class, or the arrays of a type.
 
     It returns the message, converted in place where need be, or one of that very class in place of
     one of a derived class. It raises :class:`~neuros.errors.WrongValue`.
     """
+    if isinstance(kind, ArrayType):
+        return _array_checker(kind)
     is_exact, convert = _exactness(kind).of_one, _message_converter(kind)
 
     def check(message: Any) -> Any:
@@ -75,6 +78,44 @@ class Mismatch(Exception):
         is_first = not self.path or self.path.startswith("[")
         self.path = step + self.path if is_first else f"{step}.{self.path}"
         return self
+
+
+# ---------------------------------------------------------------------- arrays
+#
+# Nothing is converted: an array of another type or shape is refused.
+
+
+def _array_checker(kind: ArrayType) -> Check:
+    dtype, shape = numpy.dtype(kind.dtype), kind.shape
+    is_bool = dtype.kind == "b"
+
+    def check(packet: Any) -> Any:
+        is_plain = type(packet) is numpy.ndarray
+        if not is_plain and isinstance(packet, numpy.ndarray):
+            # The mask of a masked array would be lost. Other classes only look otherwise.
+            is_plain = not isinstance(packet, numpy.ma.MaskedArray)
+            packet = packet.view(numpy.ndarray) if is_plain else packet
+        if not is_plain or packet.dtype != dtype or packet.shape != shape:
+            raise WrongValue("", _describe_array(packet, kind), str(kind), "the array")
+        if is_bool and (packet.view(numpy.uint8) > 1).any():  # other bytes are true, too
+            return packet.view(numpy.uint8) != 0
+        return packet
+
+    return check
+
+
+def _describe_array(value: Any, kind: ArrayType) -> str:
+    """Type and shape of what is no array of a type, and how to make one of it."""
+    if not isinstance(value, numpy.ndarray):
+        return f"{_describe(value)}: make it with numpy.asarray(values, '{kind.dtype}')"
+    found = f"{value.dtype}[{','.join(map(str, value.shape))}]"
+    if isinstance(value, numpy.ma.MaskedArray):
+        return f"a masked {found}: fill it, array.filled(0)"
+    if value.dtype != numpy.dtype(kind.dtype) and value.dtype.kind in "biuf":
+        return f"{found}: convert it, array.astype('{kind.dtype}')"
+    if value.size == kind.size:
+        return f"{found}: reshape it, array.reshape({', '.join(map(str, kind.shape))})"
+    return found
 
 
 # ---------------------------------------------------------------------- messages to leave as is

@@ -87,6 +87,7 @@ def test_a_run_gives_what_came_out(
     assert run.node_results["counter"] == {"sum": sum(thrown(7)), "eyes": thrown(7)}
     assert run.connections[EYES]["consumed"] == 10
     assert list(run.bag[EYES].array()["data"])[:10] == thrown(7)
+    assert [packet.data for packet in run.bag[EYES]][:10] == thrown(7)
     assert "counting" in run.log("counter")
     assert run.connection_frame().loc[EYES, "consumed"] == 10
     assert run.node_frame().loc["counter", "sum"] == sum(thrown(7))
@@ -165,17 +166,18 @@ def test_a_run_in_the_background_is_drained_at_the_end_of_its_block(tmp_path: Pa
 
 
 @ACCEPTANCE
-def test_a_block_that_fails_interrupts_its_run(tmp_path: Path) -> None:
+def test_a_block_that_fails_ends_its_run_and_is_the_reason(tmp_path: Path) -> None:
     live = project(tmp_path, ENDLESS).start(backend="in-process")
 
     def fail_within() -> None:
         with live:
             _await(lambda: "counting" in _log(live.folder))
-            raise LookupError
+            raise LookupError("no map\nof here")
 
     with pytest.raises(LookupError):
         fail_within()
-    assert live.wait().exit_code == 130
+    run = live.wait()
+    assert (run.exit_code, run.reason) == (7, "the program failed: LookupError: no map")
 
 
 def test_neuros_stop_ends_the_run_and_not_the_program(tmp_path: Path) -> None:

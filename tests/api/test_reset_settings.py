@@ -75,9 +75,6 @@ def _in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("NEUROS_BACKEND", raising=False)
 
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*is not connected")
-
-
 @pytest.mark.parametrize("back_end", ["local", "in-process", "process"])
 def test_a_variable_holds_for_one_episode(tmp_path: Path, back_end: str) -> None:
     with neuros.Project.from_file(dice(tmp_path, ENDLESS)).session(backend=back_end) as s:

@@ -36,7 +36,6 @@ from neuros.control import (
 from neuros.control.link import ControlLink
 from neuros.errors import RunError, UsageError
 
-pytestmark = pytest.mark.filterwarnings("ignore:.*'(push|clock)' of node 'robot' is not connected")
 EYES = "thrower.eyes"
 
 

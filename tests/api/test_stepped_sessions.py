@@ -42,10 +42,6 @@ from neuros.control import (
 from neuros.control.link import ControlLink
 from neuros.errors import ProjectError, RunError, UsageError
 
-# The input that a test pushes the robot by.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:.*'(push|clock|wind)' of node '(robot|left)' is not connected"
-)
 ACCEPTANCE = pytest.mark.acceptance
 EVERY_BACK_END = [
     "local",
@@ -374,6 +370,7 @@ def test_a_wrong_packet_of_an_observer_is_refused_and_the_session_goes_on(
     assert "Traceback" not in log.read_text("utf-8")
 
 
+@pytest.mark.filterwarnings("ignore:.*'(push|clock)' of node 'robot' is not connected")
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_in_a_run_that_is_no_session_every_packet_of_an_observer_is_refused(
     tmp_path: Path, back_end: str
@@ -435,7 +432,6 @@ def test_a_free_run_ends_where_simulated_time_is_over(held: Session) -> None:
     assert held.sim_time == pytest.approx(end_s)
 
 
-@pytest.mark.filterwarnings("ignore:.*'clock' of node 'eye' is not connected")
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_a_free_run_ends_on_time_where_rounds_gain_different_times(
     tmp_path: Path, back_end: str
@@ -449,7 +445,6 @@ def test_a_free_run_ends_on_time_where_rounds_gain_different_times(
             assert s.sim_time == pytest.approx(end_s)
 
 
-@pytest.mark.filterwarnings("ignore:.*'clock' of node 'eye' is not connected")
 def test_in_one_thread_no_round_of_a_free_run_begins_after_its_end(tmp_path: Path) -> None:
     with neuros.Project.from_file(eye(tmp_path, LEAPS)).session(backend="local") as s:
         assert s.run(duration_sim_s=2.0)
@@ -513,7 +508,6 @@ def test_a_step_that_another_question_has_overtaken_does_not_keep_the_next_one_f
         assert s["robot.pose"].count == 2
 
 
-@pytest.mark.filterwarnings("ignore:.*'image' of node 'brain' is not connected")
 @pytest.mark.parametrize("back_end", ["in-process", "process"])
 def test_after_a_step_that_took_too_long_a_large_packet_and_a_large_answer_pass_each_other(
     tmp_path: Path, back_end: str
@@ -586,7 +580,6 @@ def test_after_a_step_that_took_too_long_who_waits_for_an_output_waits_for_the_r
         timer.join()
 
 
-@pytest.mark.filterwarnings("ignore:.*'image' of node 'eye' is not connected")
 def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_ending(
     tmp_path: Path,
 ) -> None:
@@ -611,7 +604,6 @@ def test_a_program_that_does_not_read_a_large_answer_does_not_keep_the_run_from_
     assert run.nodes["eye"]["report"] == "final"
 
 
-@pytest.mark.filterwarnings("ignore:.*of node 'seer' is not connected")
 @pytest.mark.parametrize("backend", ["local", "in-process", "process"])
 def test_packets_that_are_sent_at_once_are_all_there_however_large(
     tmp_path: Path, backend: str
@@ -736,11 +728,25 @@ def test_simulated_seconds_need_a_node_that_has_them(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ its end
 
 
-def test_a_block_that_fails_interrupts_the_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("error", "exit_code", "reason"),
+    [
+        (KeyError("gain"), 7, "the program failed: KeyError: 'gain'"),
+        (AssertionError(), 7, "the program failed: AssertionError"),
+        (KeyboardInterrupt(), 130, "ended by Ctrl+C"),
+    ],
+)
+def test_a_block_that_fails_ends_the_run_and_is_the_reason(
+    tmp_path: Path, error: BaseException, exit_code: int, reason: str
+) -> None:
     project = neuros.Project.from_file(cart(tmp_path))
-    with pytest.raises(ZeroDivisionError), project.session(backend="in-process") as s:
-        s.step(until=lambda s: s["robot.pose"].count and 1 / 0)
-    assert s.close().exit_code == 130
+    s = project.session(backend="in-process")
+    with pytest.raises(type(error)), s:
+        raise error
+    run = s.close()
+    assert (run.exit_code, run.reason) == (exit_code, reason)
+    with pytest.raises(RunError):
+        run.check()
 
 
 @pytest.mark.acceptance

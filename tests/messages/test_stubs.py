@@ -27,7 +27,7 @@ from std_msgs.srv import Nothing
 from whiskeye_msgs.msg import BodyToBrain
 
 @neuros_function(inputs=["imu", "body"], outputs="joints")
-def integrate(node: neuros.Node, imu: Imu, body: BodyToBrain) -> JointState:
+def integrate(node: neuros.NodeHandle, imu: Imu, body: BodyToBrain) -> JointState:
     joints: JointState = node.make_packet("joints")
     joints.position = [imu.angular_velocity.z, 2.0]
     joints.velocity = np.zeros(2)

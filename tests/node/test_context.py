@@ -8,7 +8,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -158,20 +157,3 @@ def test_each_node_writes_to_its_own_log(tmp_path):
     for name, numbers in (("ann", (0, 2)), ("bob", (1, 3))):
         expected = "".join(f"print {i}\nchild {i}\n" for i in numbers)
         assert (tmp_path / name / "node.log").read_text() == expected
-
-
-def test_nest_that_the_process_had_before_belongs_to_the_node_that_claims_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "nest", ModuleType("nest"))
-    contexts = ContextSwitch()
-    ann, bob = (contexts.make_context({}, None, tmp_path / "project") for _ in "ab")
-    contexts.enter(ann)
-    monkeypatch.setitem(sys.modules, "another", ModuleType("another"))  # looked through then
-    contexts.enter(bob)
-    assert not contexts.why_bound(ann)
-    contexts.claim("nest")
-    contexts.enter(ann)
-    assert contexts.why_bound(bob)
-    with pytest.raises(ImportError, match="one kernel per process"):
-        importlib.import_module("nest")
-    contexts.close()
-    assert "nest" in sys.modules

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import base64
 import math
 from array import array
 
+import numpy as np
 import pytest
 from geometry_msgs.msg import Point, Polygon, PoseStamped
 from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import Bool, Float64MultiArray
 
 from neuros.control import WORLD
+from neuros.node.instruments import Tap
 from neuros.node.sampling import (
     MOST_ELEMENTS,
     MOST_VALUES,
@@ -19,6 +22,8 @@ from neuros.node.sampling import (
     number_at,
     parse_path,
 )
+from neuros.ports import Way
+from neuros.project.model import Port
 
 
 def imu(z: float) -> Imu:
@@ -104,6 +109,21 @@ def test_of_all_fields_and_of_images_one_packet_is_enough() -> None:
     sample = sampler.ask({})["camera"]
     assert sample["all"]["encoding"] == "mono8"
     assert (sample["image"]["width"], sample["image"]["data"]) == (2, "AQI=")
+
+
+def test_an_array_is_looked_at_as_the_message_that_ros_sees() -> None:
+    sampler = Sampler()
+    tap = Tap(Way.SENT, Port("state", "float64[2,3]"))
+    sampler.attach(tap)
+    sampler.ask({"state": {"all": True, "fields": ["data[4]"], "arrays": ["data"]}})
+    packet = np.arange(6.0).reshape(2, 3)
+    for observe in tap.observers:
+        observe(packet, None)
+    packet[:] = 0  # the sender's again
+    sample = sampler.ask({})["state"]
+    assert sample["values"][0][1:] == [4.0]
+    assert sample["all"] == {"data.length": 6, **{f"data[{n}]": n for n in range(6)}}
+    assert base64.b64decode(sample["arrays"]["data"][0][1]) == array("f", range(6)).tobytes()
 
 
 def test_what_cannot_be_read_is_told_and_harms_nobody() -> None:

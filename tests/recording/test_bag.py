@@ -102,6 +102,28 @@ def test_arrays_of_one_length_have_a_dimension_and_others_are_objects() -> None:
     assert [value.tolist() for value in ragged] == [[0.0], [0.0, 1.0, 2.0]]
 
 
+def test_the_numbers_of_a_multi_array_have_the_shape_of_its_layout() -> None:
+    name = "std_msgs/msg/Float64MultiArray"
+
+    def packed(*shapes: tuple[int, ...], label: str = "") -> list[bytes]:
+        made = []
+        for shape in shapes:
+            dim = [TYPES["std_msgs/msg/MultiArrayDimension"](label, size, 1) for size in shape]
+            layout = TYPES["std_msgs/msg/MultiArrayLayout"](dim, 0)
+            made.append(TYPES[name](layout, np.arange(6.0)))
+        return [bytes(STORE.serialize_cdr(message, name)) for message in made]
+
+    for label in ("", "rows", "columns"):
+        columns = columns_of(packed((2, 3), (2, 3), label=label), name, STORE)
+        assert columns["data"].tolist() == [[[0, 1, 2], [3, 4, 5]]] * 2
+        assert columns["layout.dim"].tolist() == [[2, 3]] * 2
+        assert columns["layout.data_offset"].tolist() == [0, 0]
+    reshaped = columns_of(packed((2, 3), (3, 2), (6,)), name, STORE)["data"]
+    assert [value.shape for value in reshaped] == [(2, 3), (3, 2), (6,)]
+    wrong = columns_of(packed((2, 2), (2, 2)), name, STORE)["data"]
+    assert wrong.shape == (2, 6)
+
+
 def test_more_layouts_than_one_can_keep_are_read_all_the_same() -> None:
     name = "std_msgs/msg/String"
     texts = ["x" * k for k in range(200)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 from neuros.errors import ModelError
 from neuros.ports import WorldLook
 from neuros.project.model import Node, Port
+from neuros.transport.messages import make_packet
 
 DEADLINE_S = 10.0
 
@@ -102,8 +102,7 @@ class SimulatedNode:
         self.look_at_world: WorldLook | None = None
 
     def make_packet(self, output: str) -> Any:
-        package, _, name = self.description.output(output).type.split("/")
-        return getattr(importlib.import_module(f"{package}.msg"), name)()
+        return make_packet(self.description.output(output).type)
 
     def get_logger(self) -> Log:
         return self.log

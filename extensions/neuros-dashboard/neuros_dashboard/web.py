@@ -271,5 +271,5 @@ def _source(node: Node, port: Port, key: str, title: str) -> dict[str, Any]:
         "type": port.type,
         "is_image": port.type in IMAGES,
         "is_spikes": port.type == SPIKES,
-        "array": ARRAYS.get(port.type, ""),
+        "array": ARRAYS.get(port.ros_type, ""),
     }

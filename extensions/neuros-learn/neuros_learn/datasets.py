@@ -277,7 +277,8 @@ def _values(topic: RecordedTopic, columns: Mapping[str, Column], name: str, fiel
             hint = did_you_mean(field, fields) or f"it has {', '.join(fields)}"
             raise UsageError(f"'{name}': {topic.type} has no field '{field}' ({hint})")
     else:
-        found = {k: c for k, c in fields.items() if not k.endswith(("stamp.sec", "stamp.nanosec"))}
+        about = ("stamp.sec", "stamp.nanosec", "layout.dim", "layout.data_offset")
+        found = {k: c for k, c in fields.items() if not k.endswith(about)}
     numbers = []
     for key, column in found.items():
         plain = column

@@ -128,8 +128,9 @@ def register(
 class ProjectEnv(gymnasium.Env[Any, Any]):
     """An environment whose world is a project.
 
-    A name is ``node.port``, for all numbers of its message (without texts and time stamps), or
-    ``node.port.field``; a shape in brackets is needed where the message does not fix the length.
+    A name is ``node.port``, for its array, or all numbers of its message (without texts and time
+    stamps); or ``node.port.field``. A shape in brackets is needed where the message does not fix
+    the length.
     One name makes a ``Box``, a list a ``Dict`` of boxes, by the names without brackets.
 
     Args:
@@ -199,7 +200,7 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
             )
         )
         loaded = project if isinstance(project, Project) else Project.from_file(project)
-        described = loaded.check_with({})
+        described = loaded.check_with({}, is_held=True)
         self._camera = _camera(described, render_mode, render)
         self.render_mode = render_mode
         self.metadata = {"render_modes": []}
@@ -310,9 +311,9 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
     ) -> None:
         """Find the numbers of all actions and observations. Raises as the class."""
         controls = {} if model is None else _controls(described, project.file.parent / model)
-        self._actions = [_Numbers(described, name, ranges, controls) for name in _listed(action)]
+        self._actions = [_numbers(described, name, ranges, controls) for name in _listed(action)]
         self._observations = [
-            _Numbers(described, name, ranges, is_output=True) for name in _listed(observation)
+            _numbers(described, name, ranges, is_output=True) for name in _listed(observation)
         ]
         names = [each.name for each in (*self._actions, *self._observations)]
         if unknown := ranges.keys() - {*names}:
@@ -341,6 +342,21 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         return {**({} if sim_time is None else {"sim_time": sim_time}), **own}
 
 
+def _numbers(
+    project: Described,
+    written: str,
+    ranges: Mapping[str, tuple[Any, Any]],
+    controls: Mapping[str, tuple[Any, Any]] = _NOTHING,
+    *,
+    is_output: bool = False,
+) -> _Numbers:
+    """The numbers of a name; ``ranges`` are by name, ``controls`` by input."""
+    port = _port(project, _split(written)[0], is_output=is_output)
+    inputs = [] if is_output else _inputs_behind(project, _split(written)[0])
+    driven = controls.get(inputs[0]) if inputs else None
+    return (_ArrayNumbers if port.array else _Numbers)(port, written, inputs, ranges, driven)
+
+
 class _Numbers:
     """Numbers of the messages of a port, as one array.
 
@@ -352,17 +368,20 @@ class _Numbers:
 
     def __init__(
         self,
-        project: Described,
+        port: Port,
         written: str,
+        inputs: Sequence[str],
         ranges: Mapping[str, tuple[Any, Any]],
-        controls: Mapping[str, tuple[Any, Any]] = _NOTHING,
-        *,
-        is_output: bool = False,
+        driven: tuple[Any, Any] | None,
     ) -> None:
         self.port, field, shape = _split(written)
         self.name = self.port + field
-        port = _port(project, self.port, is_output=is_output)
-        self.inputs = [] if is_output else _inputs_behind(project, self.port)
+        self.inputs = inputs
+        is_bool = self._resolve(port, written, field, shape)
+        self.space = self._space(ranges.get(self.name, (0, 1) if is_bool else driven))
+
+    def _resolve(self, port: Port, written: str, field: str, shape: tuple[int, ...] | None) -> bool:
+        """Find the numbers, their type and their shape; whether all are truth values."""
         self._kind = message_class(port.type)
         leaves = _numbers_of(self._kind, field)
         if not leaves:
@@ -386,8 +405,7 @@ class _Numbers:
         self._is_flat = all(leaf.field.shape is Shape.SINGLE for leaf in leaves)
         is_bool = all(leaf.field.type.sort is Sort.BOOL for leaf in leaves)
         self._dtype = np.dtype(np.uint8) if is_bool else np.result_type(*map(_dtype, leaves))
-        driven = controls.get(self.inputs[0]) if self.inputs else None
-        self.space = self._space(ranges.get(self.name, (0, 1) if is_bool else driven))
+        return is_bool
 
     def _space(self, bounds: tuple[Any, Any] | None) -> spaces.Box:
         if bounds is None:
@@ -430,6 +448,47 @@ class _Numbers:
             setattr(owner, leaf.path[-1][1:], numbers[0] if is_one else numbers)
             start += size
         return message
+
+
+class _ArrayNumbers(_Numbers):
+    """The numbers of a port of arrays."""
+
+    def _resolve(self, port: Port, written: str, field: str, shape: tuple[int, ...] | None) -> bool:
+        array = port.array
+        assert array is not None
+        if field:
+            raise UsageError(
+                f"'{written}': {self.port} is a {array}, without fields: leave them out"
+            )
+        if shape is not None and prod(shape) != array.size:
+            raise UsageError(
+                f"'{written}': its arrays have {array.size} numbers, not {prod(shape)}"
+            )
+        self._array, self._shape = array, shape or array.shape
+        is_bool = array.dtype == "bool"
+        self._dtype = np.dtype(np.uint8 if is_bool else array.dtype)
+        return is_bool
+
+    def read(self, message: Any) -> Any:
+        """The numbers of an array."""
+        return np.array(message, self._dtype).reshape(self._shape)
+
+    def message(self, values: Any) -> Any:
+        """An array of these numbers; raises ``ValueError`` for one that does not fit."""
+        given, is_float = np.asarray(values), self._dtype.kind == "f"
+        if given.size != self._array.size:
+            raise UsageError(f"{self.name} takes {self._array.size} numbers, not {given.size}")
+        given = given.reshape(self._array.shape)
+        if given.dtype == self._array.dtype:
+            return given
+        if given.dtype.kind == "f" and not is_float:
+            given = np.rint(given)
+        with np.errstate(over="ignore", invalid="ignore"):
+            made = given.astype(self._array.dtype)
+        pair = (np.isfinite(made), np.isfinite(given)) if is_float else (made, given)
+        if not np.array_equal(*pair):
+            raise ValueError(f"{self.name}: {values} does not fit in {self._array}")
+        return made
 
 
 _CONVERT: Mapping[Sort, Callable[[Any], list[Any]]] = {
@@ -614,8 +673,9 @@ def _controls(project: Described, model: Path) -> dict[str, tuple[Any, Any]]:
     for node in project.nodes:
         for port in node.inputs:
             wanted = port.mujoco.get("actuators", [port.mujoco.get("actuator")])
-            if all(name in names for name in wanted):
-                low, high = limits[[names.index(name) for name in wanted]].T
+            if wanted == "all" or all(name in names for name in wanted):
+                chosen = slice(None) if wanted == "all" else [names.index(each) for each in wanted]
+                low, high = limits[chosen].T
                 found[f"{node.name}.{port.name}"] = low, high
     return found
 

@@ -44,7 +44,7 @@ from neuros.hooks import neuros_function
 @neuros_function(inputs=["camera", "pose"], outputs=["command", "said", "joints"])
 def act(node, camera, pose):
     command, said = node.make_packet("command"), node.make_packet("said")
-    command.data = 10.0 * pose.point.x
+    command[0] = 10.0 * pose.point.x
     said.data = [1] * int(pose.point.x)
     joints = node.make_packet("joints")
     joints.name, joints.position = ["a", "b"], [pose.point.x, 1.0]
@@ -72,7 +72,7 @@ def port(name: str, kind: str) -> dict[str, str]:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("datasets")
     seen = [port("camera", "sensor_msgs/msg/Image"), port("pose", "geometry_msgs/msg/PointStamped")]
-    command = port("command", "std_msgs/msg/Float64")
+    command = port("command", "float64[1]")
     said = port("said", "std_msgs/msg/UInt8MultiArray")
     joints = port("joints", "sensor_msgs/msg/JointState")
     nodes: list[dict[str, Any]] = [

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import nbclient
+import nbformat
 import numpy as np
 import pytest
 from cart_project import cart
@@ -188,10 +190,6 @@ def sensors(tmp_path: Path) -> Path:
     return tmp_path
 
 
-NOT_CONNECTED = pytest.mark.filterwarnings("ignore:.*of node 'robot' is not connected")
-
-
-@NOT_CONNECTED
 def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
     env = neuros.gym.make(
         sensors,
@@ -226,7 +224,6 @@ def test_spaces_follow_from_the_types_of_messages(sensors: Path) -> None:
         env.close()
 
 
-@NOT_CONNECTED
 @pytest.mark.parametrize(
     ("changed", "complaint"),
     [
@@ -269,7 +266,6 @@ def test_what_cannot_be_is_said_with_what_can(
     assert not (sensors / "runs").exists()
 
 
-@NOT_CONNECTED
 def test_functions_get_what_their_parameters_name(sensors: Path) -> None:
     def gained(
         action: Any, previous_observation: Any, observation: Any, scale: float = 2.0
@@ -300,7 +296,6 @@ def test_functions_get_what_their_parameters_name(sensors: Path) -> None:
         env.close()
 
 
-@NOT_CONNECTED
 @pytest.mark.parametrize(
     ("changed", "complaint"),
     [
@@ -448,7 +443,6 @@ class TestRegistration:
 
 
 @pytest.mark.acceptance
-@NOT_CONNECTED
 def test_a_length_that_messages_do_not_have_is_said_with_that_they_have(sensors: Path) -> None:
     arguments = {"action": "robot.order", "observation": "robot.scan.data[7]", "reward": float}
     env = neuros.gym.make(sensors, **arguments)
@@ -460,7 +454,6 @@ def test_a_length_that_messages_do_not_have_is_said_with_that_they_have(sensors:
 
 
 @pytest.mark.acceptance
-@NOT_CONNECTED
 def test_a_project_that_waits_for_a_command_gets_one_at_each_reset(tmp_path: Path) -> None:
     def brain(**others: Any) -> gymnasium.Env[Any, Any]:
         return neuros.gym.make(
@@ -553,6 +546,18 @@ def test_stable_baselines3_trains_it_in_two_minutes_and_the_node_acts_as_its_mod
     assert min(_upright_s(made, tmp_path, seeds=(1, 2, 3))) > 9.9
 
 
+@pytest.mark.acceptance
+def test_the_notebook_learns_it_and_runs_what_it_has_learnt_as_a_node(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="pip install torch stable-baselines3")
+    made = shutil.copytree(EXAMPLE, tmp_path / "cartpole")
+    (made / "network.npz").unlink()
+    notebook = nbformat.read(made / "learn.ipynb", as_version=4)
+    client = nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": made}})
+    client.execute()
+    *_, upright = notebook.cells[-1].outputs
+    assert float(upright["data"]["text/plain"]) > 9.9
+
+
 def _upright_s(example: Path, folder: Path, seeds: Sequence[int]) -> list[float]:
     """For how long the network of an example keeps the pole upright in 10 s of simulated time."""
     project = neuros.Project.from_file(example)
@@ -564,3 +569,119 @@ def _upright_s(example: Path, folder: Path, seeds: Sequence[int]) -> list[float]
         for seed in seeds
     ]
     return [run.node_results["policy"]["upright_s"] for run in runs]
+
+
+# ---------------------------------------------------------------------- ports of arrays
+
+# Of Gymnasium's model.
+DEPRECATED = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
+SIMULATORS = ROOT / "docs" / "simulators.md"
+
+
+def cheetah(folder: Path) -> Path:
+    """The half-cheetah of the page, whose action and observation are arrays."""
+    model = Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml"
+    shutil.copy(model, folder)
+    page = SIMULATORS.read_text("utf-8").partition("### Arrays\n")[2]
+    node, plugin = re.findall(r"```(?:json|python)\n(.*?)```", page, re.DOTALL)[:2]
+    (folder / "cheetah.py").write_text(plugin)
+    (folder / "project.json").write_text(f'{{"nodes": [{node}]}}')
+    return folder
+
+
+def run_cheetah(folder: Path, **others: Any) -> gymnasium.Env[Any, Any]:
+    arguments: dict[str, Any] = {
+        "action": "cheetah.action",
+        "observation": "cheetah.observation",
+        "reward": lambda env: float(env.observation[8]),
+        "model": "half_cheetah.xml",
+    }
+    return neuros.gym.make(cheetah(folder), **(arguments | others))
+
+
+@DEPRECATED
+def test_ports_of_arrays_have_spaces_of_their_type_and_shape(tmp_path: Path) -> None:
+    env = run_cheetah(tmp_path)
+    assert env.action_space == gymnasium.spaces.Box(-1.0, 1.0, (6,), np.float64)
+    assert env.observation_space == gymnasium.spaces.Box(-np.inf, np.inf, (17,), np.float64)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*Box observation space m.* is .*infinity")
+        check_env(env.unwrapped, skip_render_check=True)
+    env.close()
+
+
+@DEPRECATED
+def test_a_cheetah_of_arrays_is_bare_mujoco_bit_for_bit(tmp_path: Path) -> None:
+    import mujoco
+
+    env = run_cheetah(tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "half_cheetah.xml"))
+    for _ in range(2):
+        observation, _ = env.reset()
+        bare = mujoco.MjData(model)
+        mujoco.mj_step(model, bare, nstep=5)  # without an action
+        assert np.array_equal(observation, np.concatenate([bare.qpos[1:], bare.qvel]))
+        for action in np.random.default_rng(1).uniform(-1, 1, (100, 6)):
+            observation = env.step(action)[0]
+            bare.ctrl[:] = action
+            mujoco.mj_step(model, bare, nstep=5)
+            assert observation.tobytes() == np.concatenate([bare.qpos[1:], bare.qvel]).tobytes()
+        observation[:] = 0  # is the program's own
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        ({"action": "cheetah.action.data[6]"}, r"cheetah.action is a float64\[6\], without fields"),
+        ({"observation": "cheetah.observation[18]"}, "its arrays have 17 numbers, not 18"),
+        ({"action": "cheetah.actoin"}, "did you mean 'cheetah.action'"),
+    ],
+)
+def test_wrong_names_of_arrays_are_told(tmp_path: Path, arguments: Any, text: str) -> None:
+    with pytest.raises(UsageError, match=text):
+        run_cheetah(tmp_path, **arguments)
+
+
+MIRROR = """
+from neuros.hooks import Optional, neuros_function
+
+@neuros_function(inputs=[Optional("on"), Optional("level")], outputs=[Optional("is_on"), "image"])
+def show(node, on, level):
+    image = node.make_packet("image")
+    if level is not None:
+        image[:] = level.reshape(2, 2)
+    return on if on is None else ~on, image
+"""
+
+
+def test_arrays_of_bools_and_whole_numbers_and_any_shape(tmp_path: Path) -> None:
+    (tmp_path / "mirror.py").write_text(MIRROR)
+    types = {"on": "bool[2]", "level": "uint8[4]", "is_on": "bool[2]", "image": "float32[2,2]"}
+    ports = [{"name": name, "type": kind} for name, kind in types.items()]
+    node = {"name": "m", "container": "neuros_python", "plugin": "mirror.py"}
+    node |= {"inputs": ports[:2], "outputs": ports[2:]}
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [node]}))
+    env = neuros.gym.make(
+        tmp_path,
+        action=["m.on", "m.level"],
+        observation=["m.is_on", "m.image"],
+        reward=lambda env: 0.0,
+        initial_action={"m.on": [0, 0], "m.level": [0, 0, 0, 0]},
+        output=tmp_path / "run",
+    )
+    box = gymnasium.spaces.Box
+    assert env.action_space["m.on"] == box(0, 1, (2,), np.uint8)
+    assert env.action_space["m.level"] == box(0, 255, (4,), np.uint8)
+    assert env.observation_space["m.image"] == box(-np.inf, np.inf, (2, 2), np.float32)
+    env.reset()
+    action = {"m.on": np.array([0, 1], np.uint8), "m.level": np.array([1.0, 2.0, 3.4, 255.0])}
+    seen = env.step(action)[0]
+    assert seen["m.is_on"].tolist() == [1, 0]
+    assert seen["m.image"].tolist() == [[1.0, 2.0], [3.0, 255.0]]
+    for wrong in ([0, 0, 0, 256], [0, 0, 0, -1], [0, 0, 0, np.nan]):
+        with pytest.raises(ValueError, match=r"m.level: .* does not fit in uint8\[4\]"):
+            env.step(action | {"m.level": np.array(wrong)})
+    with pytest.raises(UsageError, match=r"m\.on takes 2 numbers, not 3"):
+        env.step(action | {"m.on": np.zeros(3)})
+    env.close()

@@ -19,7 +19,7 @@ from neuros_learn.nir.network_file import NetworkError, read_graph
 
 from neuros.api.loading import load_with_messages
 from neuros.backends.docker.back_end import check_modules
-from neuros.errors import ProjectError
+from neuros.errors import HookError, ProjectError
 from neuros.project.model import Node, Port
 from neuros.project.split import project_to_json
 from neuros.testing import PluginHarness
@@ -378,6 +378,34 @@ class TestNode:
         found = [packet.data.tolist() for packet in harness.received("output")]
         assert found == wanted.astype(float).tolist()
 
+    def test_packets_may_be_arrays(self) -> None:
+        with np.load(TRACES / "leaky_zero_now.npz") as trace:
+            inputs, wanted = trace["inputs"][:40], trace["outputs"][:40]
+        kinds = [f"float32[{each.shape[1]}]" for each in (inputs, wanted)]
+        harness = PluginHarness(
+            "neuros.snn.nir.plugin",
+            inputs={"input": kinds[0]},
+            outputs={"output": kinds[1]},
+            environment={"NETWORK": str(TRACES / "leaky_zero_now.nir")},
+        )
+        harness.send("input", *inputs.astype(np.float32))
+        harness.run()
+        assert np.array_equal(harness.received("output"), wanted)
+
+    def test_an_array_of_another_size_is_told(self) -> None:
+        harness = PluginHarness(
+            "neuros.snn.nir.plugin",
+            inputs={"input": MULTI},
+            outputs={"output": "float32[99]"},
+            environment={"NETWORK": str(TRACES / "leaky_zero_now.nir")},
+        )
+        with np.load(TRACES / "leaky_zero_now.npz") as trace:
+            packet = harness.make_packet("input")
+            packet.data = trace["inputs"][0].astype(np.float32)
+        harness.send("input", packet)
+        with pytest.raises(HookError, match="output 'output' carries 99 values, and the network"):
+            harness.run()
+
     def test_ports_and_parameters_are_checked_with_the_network(self) -> None:
         node = Node(
             "brain",
@@ -389,8 +417,9 @@ class TestNode:
         )
         assert sorted(problems_of(node, TRACES / "leaky_zero.nir")) == [
             "a network has no parameter 'rest' (did you mean 'reset'?)",
-            "the input 'inputs' must be of std_msgs/msg/Float32MultiArray, Float32,"
-            " Float64MultiArray or Float64, but is std_msgs/msg/String",
+            "the input 'inputs' must be of float32[...], float64[...],"
+            " std_msgs/msg/Float32MultiArray, Float32, Float64MultiArray or Float64,"
+            " but is std_msgs/msg/String",
             "the network has no Input 'inputs', as the input (it has 'input')",
             "the node declares no input 'input', but the network has an Input of that name",
             "the parameter 'dt' must be a number of seconds, above 0",

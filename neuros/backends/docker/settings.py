@@ -234,7 +234,7 @@ def mount(here: Path, there: Path, *, read_only: bool = True) -> dict[str, Any]:
 def inside(file: NodeFile) -> NodeFile:
     """A node with the paths of its container; paths without a mount stay."""
     here = file.folders
-    places = [(here.project, FOLDERS.project), (here.workspace, FOLDERS.workspace)]
+    places = [(getattr(here, each.name), getattr(FOLDERS, each.name)) for each in fields(Folders)]
     places += [(python.parent, MESSAGES / python.parent.name) for python in file.messages]
     return replace(
         file,

@@ -16,12 +16,14 @@ import mujoco
 
 from neuros.errors import ModelError
 from neuros.ports import Packet
+from neuros.project.message_types import array_type
 from neuros.project.model import Node, Port
 from neuros.simulators.mujoco.lookup import (
     Faults,
     Problems,
     did_you_mean,
     find,
+    form_of,
     id_of,
     is_list_of_names,
     names_of,
@@ -37,6 +39,8 @@ _TWIST_FIELDS = {
     3: (("linear", "x"), ("linear", "y"), ("angular", "z")),
     6: tuple((part, axis) for part in ("linear", "angular") for axis in "xyz"),
 }
+ALL = "all"
+"""In the place of the names of actuators: all of the model, in its order."""
 _NAMING = ("actuator", "actuators", "joint", "joints")
 _GAINS: Mapping[str, Mapping[str, bool]] = {
     "position": {"kp": True, "kv": False},
@@ -62,7 +66,9 @@ class Drive:
 
 @dataclass(frozen=True)
 class CommandDeclaration:
-    """The actuators behind an input, in their order. ``pointer`` is the place of their names.
+    """The actuators behind an input, in their order; empty: all of the model.
+
+    ``pointer`` is the place of their names.
 
     With a ``drive`` the names are joints, and each joint gets an actuator of its name.
     """
@@ -95,17 +101,22 @@ def _command(port: Port, pointer: str, problems: Problems) -> CommandDeclaration
     faults.unknown_keys(port.mujoco, (*_NAMING, *(_DRIVE_KEYS if drives else ())))
     value, is_one = port.mujoco[key], key in ("actuator", "joint")
     names = (value,) if is_one else value
-    if not is_list_of_names(names):
+    if key == "actuators" and value == ALL:
+        names = ()
+    elif not is_list_of_names(names):
         faults.add(key, f"{value!r} is not a {'name' if is_one else 'list of names'}")
         return None
     drive = _read_drive(port.mujoco, faults) if drives else None
-    if port.type not in _MESSAGE_TYPES:
+    form = form_of(port.type)
+    if port.array and names and port.array.shape != (len(names),):
+        faults.add(key, f"a {port.type} does not fit {len(names)} actuators")
+    if form not in _MESSAGE_TYPES:
         if drive is None:  # with a drive, the plugin may read the message and drive each joint
             known = " or ".join(_MESSAGE_TYPES)
             faults.add(key, f"input '{port.name}' is a {port.type}; a command is {known}")
-    elif (sizes := _MESSAGE_TYPES[port.type][1]) and len(names) not in sizes:
+    elif (sizes := _MESSAGE_TYPES[form][1]) and len(names) not in sizes:
         some = " or ".join(map(str, sizes))
-        faults.add(key, f"a {port.type} drives {some} actuators, not {len(names)}")
+        faults.add(key, f"a {port.type} drives {some} actuators, not {len(names) or ALL}")
     if faults.found:
         return None
     return CommandDeclaration(port.name, port.type, tuple(names), f"{pointer}/{key}", drive)
@@ -173,8 +184,14 @@ def bind_commands(
             if find(model, (sort,), name, declared.pointer, problems)
         ]
         found = [find(model, ("actuator",), name, declared.pointer, problems) for name in known]
-        read, _ = _MESSAGE_TYPES.get(declared.type, (_refuse, ()))
-        command = read(model, [actuator for _, actuator in filter(None, found)], declared.input)
+        read, _ = _MESSAGE_TYPES.get(form_of(declared.type), (_refuse, ()))
+        actuators = [actuator for _, actuator in filter(None, found)]
+        if not declared.actuators:
+            actuators, array = [*range(model.nu)], array_type(declared.type)
+            if array is not None and array.shape != (model.nu,):
+                fault = f"a {array} does not fit the {model.nu} actuators of the model"
+                problems.add(declared.pointer, fault)
+        command = read(model, actuators, declared.input)
         commands[declared.input] = _checked(declared.input, command)
     return commands
 
@@ -225,6 +242,10 @@ def _floats(model: Any, actuators: list[int], where: str) -> Command:
         return [(index, float(value)) for index, value in zip(actuators, packet.data, strict=True)]
 
     return read
+
+
+def _array(model: Any, actuators: list[int], where: str) -> Command:
+    return lambda packet: list(zip(actuators, packet.tolist(), strict=True))
 
 
 def _twist(model: Any, actuators: list[int], where: str) -> Command:
@@ -283,6 +304,8 @@ def _field(model: Any, actuator: int) -> str:
 _MESSAGE_TYPES: Mapping[str, tuple[Callable[[Any, list[int], str], Command], tuple[int, ...]]] = {
     "std_msgs/msg/Float64": (_float, (1,)),
     "std_msgs/msg/Float64MultiArray": (_floats, ()),
+    "float64[...]": (_array, ()),
+    "float32[...]": (_array, ()),
     "sensor_msgs/msg/JointState": (_joint_state, ()),
     "geometry_msgs/msg/Twist": (_twist, (2, 3, 6)),
 }

@@ -9,6 +9,7 @@ from typing import Any
 import mujoco
 
 from neuros.errors import ModelError
+from neuros.project.message_types import array_type
 
 _SORTS = {
     "site": (mujoco.mjtObj.mjOBJ_SITE, "nsite"),
@@ -74,6 +75,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     if not names:
         return ""
     return f" (there are: {', '.join(names[:8])}{', ...' if len(names) > 8 else ''})"
+
+
+def form_of(type_name: str) -> str:
+    """The type of a port without the shape of an array: ``float64[...]``."""
+    array = array_type(type_name)
+    return type_name if array is None else f"{array.dtype}[...]"
 
 
 def is_list_of_names(value: object) -> bool:

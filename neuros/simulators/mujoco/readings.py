@@ -1,7 +1,8 @@
-"""Readings of the sensors that a model declares itself, and transforms of its elements."""
+"""Readings of the sensors that a model declares itself, arrays of ``mjData``, and transforms."""
 
 from __future__ import annotations
 
+import re
 from array import array
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
@@ -10,7 +11,7 @@ import mujoco
 import numpy as np
 
 from neuros.ports import Packet
-from neuros.simulators.mujoco.lookup import Problems, names_of
+from neuros.simulators.mujoco.lookup import Problems, did_you_mean, names_of
 from neuros.simulators.mujoco.sensor_base import (
     WORLD_FRAME,
     Sensor,
@@ -24,6 +25,7 @@ from neuros.simulators.mujoco.sensor_base import (
 _OPTICAL = np.array([0.0, 1.0, 0.0, 0.0])
 """From the axes of MuJoCo's cameras (y up, looking along -z) to those of REP 103 (y down, z)."""
 _FLOATS = "std_msgs/msg/Float64MultiArray"
+_ARRAYS = ("float64[...]", "float32[...]")
 # These sensors measure at a site, along its axes.
 _LOCAL = {"accelerometer", "velocimeter", "gyro", "force", "torque", "magnetometer", "rangefinder"}
 _INFRARED = 1
@@ -81,7 +83,7 @@ class Reading(Sensor):
 
     Units and axes are MuJoCo's; ``gyro`` and the like measure along the axes of their site.
     ``force`` and ``torque`` fill their half of a WrenchStamped: the load of a child on its parent.
-    A Float64MultiArray holds any sensor. No noise is added.
+    A Float64MultiArray, or an array, holds any sensor. No noise is added.
 
     Attributes:
         kinds: MuJoCo's kind of each sensor, as ``"gyro"``.
@@ -89,8 +91,8 @@ class Reading(Sensor):
     """
 
     kind = "reading"
-    types = (_FLOATS, *_FORMS)
-    list_types = (_FLOATS,)
+    types = (_FLOATS, *_ARRAYS, *_FORMS)
+    list_types = (_FLOATS, *_ARRAYS)
     sorts = ("sensor",)
 
     def bind(self, problems: Problems) -> None:
@@ -108,6 +110,7 @@ class Reading(Sensor):
         self._frame = self._frame_of(indices[0])
         self._form = _FORMS.get(self.declared.type)
         count = int(model.sensor_dim[indices[0]])
+        self.check_array(problems, "the readings", sum(int(model.sensor_dim[i]) for i in indices))
         fitting = [name for name, form in _FORMS.items() if self._fits(form, count)]
         if self._form is not None and self.declared.type not in fitting:
             numbers = "1 number" if count == 1 else f"{count} numbers"
@@ -117,6 +120,9 @@ class Reading(Sensor):
                 f" {' or '.join([*fitting, _FLOATS])}, but output '{self.declared.output}' is a"
                 f" {self.declared.type}",
             )
+
+    def fill_array(self, packet: Packet, data: Any) -> None:
+        _fill_rows(packet, [data.sensordata[place] for place in self._places])
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         if self._form is None:
@@ -142,6 +148,77 @@ class Reading(Sensor):
         else:
             sort, element = model.sensor_reftype[index], model.sensor_refid[index]
         return mujoco.mj_id2name(model, int(sort), int(element)) or ""
+
+
+_STATE = (
+    *("time", "qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos"),
+    *("mocap_quat", "userdata"),
+)
+"""Arrays of ``mjData`` that belong to the state of a step, or are set from outside."""
+_COMPUTED = (
+    *("qacc", "act_dot", "sensordata", "energy", "actuator_force", "actuator_length"),
+    *("actuator_velocity", "qfrc_actuator", "qfrc_bias", "qfrc_passive", "qfrc_constraint"),
+    *("xpos", "xquat", "xmat", "xipos", "ximat", "xanchor", "xaxis", "geom_xpos", "geom_xmat"),
+    *("site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "subtree_com", "cinert", "cvel"),
+    *("ten_length", "ten_velocity", "cacc", "cfrc_int", "cfrc_ext"),
+)
+_AFTER_CONSTRAINT = {"cacc", "cfrc_int", "cfrc_ext"}
+_SLICE = re.compile(r"(\w+)(?:\[(-?\d{1,9})?:(-?\d{1,9})?\])?", re.ASCII)
+
+
+class Data(Sensor):
+    """Arrays of MuJoCo's mjData by their names (qpos, qvel, sensordata), or a list of them.
+
+    All their numbers follow each other, row by row. ``qpos[2:]`` is a part of an array, as in
+    Python. Units are MuJoCo's.
+    """
+
+    kind = "data"
+    types = list_types = _ARRAYS
+    sorts = ("array of mjData",)
+
+    def find(self, name: str, problems: Problems) -> tuple[str, int] | None:
+        match = _SLICE.fullmatch(name)
+        if match is not None and match[1] in (*_STATE, *_COMPUTED):
+            return match[1], 0
+        hint = did_you_mean(match[1] if match else name, (*_STATE, *_COMPUTED))
+        text = f"'{name}' is neither an array of mjData nor a part of one, as 'qpos[2:]'{hint}"
+        problems.add(f"{self.declared.pointer}/element", text)
+        return None
+
+    def bind(self, problems: Problems) -> None:
+        names = [name for name, _ in self.elements]
+        self.needs_forward = not {*names} <= {*_STATE}
+        self._is_after_constraint = not {*names}.isdisjoint(_AFTER_CONSTRAINT)
+        self._time = np.zeros(1)
+        self._data: Any = None
+        count = sum(part.size for part in self._parts_of(mujoco.MjData(self.model)))
+        self.check_array(problems, ", ".join(self.declared.elements), count)
+
+    def fill_array(self, packet: Packet, data: Any) -> None:
+        if data is not self._data:
+            self._data, self._parts = data, self._parts_of(data)
+        self._time[0] = data.time
+        # mj_forward leaves these out unless a sensor of the model needs them.
+        if self._is_after_constraint and not getattr(data, "flg_rnepost", False):
+            mujoco.mj_rnePostConstraint(self.model, data)
+        _fill_rows(packet, self._parts)
+
+    def _parts_of(self, data: Any) -> list[Any]:
+        """Views of the arrays."""
+        parts = []
+        for name in self.declared.elements:
+            match = _SLICE.fullmatch(name)
+            assert match is not None
+            whole = self._time if match[1] == "time" else getattr(data, match[1])
+            first, end = (int(each) if each else None for each in match.groups()[1:])
+            parts.append(whole[first:end].reshape(-1))
+        return parts
+
+
+def _fill_rows(packet: Packet, parts: list[Any]) -> None:
+    """Fill an array with numbers, row by row."""
+    np.concatenate(parts, out=packet.reshape(-1), casting="same_kind")
 
 
 class Transforms(Sensor):

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from neuros.ports import Packet
+from neuros.project.message_types import ArrayType, array_type
 from neuros.simulators.mujoco.cameras import Cameras
 from neuros.simulators.mujoco.lookup import Problems, find
 from neuros.time import to_stamp
@@ -64,6 +65,11 @@ class SensorDeclaration:
     options: Mapping[str, float] = field(default_factory=dict)
 
     @property
+    def array(self) -> ArrayType | None:
+        """The type of the output if it sends arrays."""
+        return array_type(self.type)
+
+    @property
     def width(self) -> int:
         """Pixels per row, of a camera."""
         return int(self.options["width"])
@@ -81,12 +87,15 @@ class Sensor:
 
     Attributes:
         kind: the value of ``"sensor"`` in a node file.
-        types: the message types that it can fill.
+        types: the message types that it can fill, and arrays of any shape, ``float64[...]``.
         list_types: those of them that hold a list of elements.
+        axes: the keys of its declaration that the axes of an array stand for, if left out.
         sorts: the sorts of elements it measures; the first sort that has the name wins.
         is_optional: whether the element may be left out.
         keys: further keys of its declaration.
         is_rendered: whether it renders pictures.
+        needs_forward: whether it measures what MuJoCo computes from the state of a step only in
+            ``mj_forward``.
         declared: the declaration.
         elements: sort and id of each element that it names.
     """
@@ -97,17 +106,22 @@ class Sensor:
     sorts: ClassVar[tuple[str, ...]] = ()
     is_optional: ClassVar[bool] = False
     keys: ClassVar[Mapping[str, Key]] = MappingProxyType({})
+    axes: ClassVar[tuple[str, ...]] = ()
     is_rendered: ClassVar[bool] = False
+    needs_forward = True
 
     def __init__(
         self, declared: SensorDeclaration, model: Any, cameras: Cameras, problems: Problems
     ) -> None:
         self.declared, self.model, self.cameras = declared, model, cameras
-        pointer = f"{declared.pointer}/element"
-        found = [find(model, self.sorts, name, pointer, problems) for name in declared.elements]
+        found = [self.find(name, problems) for name in declared.elements]
         self.elements = [element for element in found if element]
         if len(self.elements) == len(found):
             self.bind(problems)
+
+    def find(self, name: str, problems: Problems) -> tuple[str, int] | None:
+        """Sort and id of an element that the declaration names; a problem is reported."""
+        return find(self.model, self.sorts, name, f"{self.declared.pointer}/element", problems)
 
     def bind(self, problems: Problems) -> None:
         """Prepare to measure the elements, once; problems with them are reported."""
@@ -115,6 +129,24 @@ class Sensor:
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         """Fill a message from the data right after ``mj_forward``."""
         raise NotImplementedError
+
+    def fill_array(self, packet: Packet, data: Any) -> None:
+        """Fill an array of zeros, in the place of a message."""
+        raise NotImplementedError
+
+    def check_array(self, problems: Problems, what: str, *shape: int) -> None:
+        """Report an output whose arrays do not hold ``what``, of this shape.
+
+        Numbers in one row fill an array of any shape, row by row.
+        """
+        array = self.declared.array
+        if array is None or array.shape == shape or (len(shape) == 1 and array.size == shape[0]):
+            return
+        problems.add(
+            self.declared.pointer,
+            f"{what} fill {ArrayType(array.dtype, shape)}, but output '{self.declared.output}'"
+            f" is a {array}",
+        )
 
 
 def set_header(header: Any, time_ns: int, frame: str) -> None:

@@ -4,10 +4,10 @@ To add one, write a subclass of :class:`Sensor` here and name it in :data:`SENSO
 :func:`write_schema` puts it into the schema of node files.
 
 Declarations are read and checked without a model, and all problems are gathered. A sensor finds its
-elements once, by name, and fills packets from the data after ``mj_forward``. Where the model has a
-sensor at the element (``gyro``, ``accelerometer``, ``framequat``) its reading is used, with its
-cutoff; otherwise the quantity is computed as MuJoCo's sensors compute it. Distances are metres. As
-in REP 117, ``inf`` is "nothing within range", ``-inf`` "too close".
+elements once, by name, and fills packets from the data, after ``mj_forward`` if it needs that.
+Where the model has a sensor at the element (``gyro``, ``accelerometer``, ``framequat``) its reading
+is used, with its cutoff; otherwise the quantity is computed as MuJoCo's sensors compute it.
+Distances are metres. As in REP 117, ``inf`` is "nothing within range", ``-inf`` "too close".
 """
 
 from __future__ import annotations
@@ -32,10 +32,11 @@ from neuros.simulators.mujoco.lookup import (
     Faults,
     Problems,
     did_you_mean,
+    form_of,
     is_list_of_names,
     names_of,
 )
-from neuros.simulators.mujoco.readings import Reading, Transforms
+from neuros.simulators.mujoco.readings import Data, Reading, Transforms
 from neuros.simulators.mujoco.sensor_base import (
     PICTURE,
     WORLD_FRAME,
@@ -219,7 +220,7 @@ class Contacts(Sensor):
     ========================  ==========================================================
     ``std_msgs/Bool``         whether anything presses on the element
     ``std_msgs/Float64``      sum of the normal forces on it, newtons
-    ``Float64MultiArray``     this sum for each element of a list, in its order
+    ``Float64MultiArray``     this sum for each element of a list, in its order; an array, too
     ``WrenchStamped``         total force on it (newtons) and torque (N m) about its own
                               origin, both along the axes of the world
     ========================  ==========================================================
@@ -233,13 +234,18 @@ class Contacts(Sensor):
         "std_msgs/msg/Bool",
         "std_msgs/msg/Float64",
         "std_msgs/msg/Float64MultiArray",
+        "float64[...]",
         "geometry_msgs/msg/WrenchStamped",
     )
-    list_types = ("std_msgs/msg/Float64MultiArray",)
+    list_types = ("std_msgs/msg/Float64MultiArray", "float64[...]")
     sorts = ("geom", "body")
 
     def bind(self, problems: Problems) -> None:
         self._touches = [_Touch(self.model, *element) for element in self.elements]
+        self.check_array(problems, "the forces", len(self._touches))
+
+    def fill_array(self, packet: Packet, data: Any) -> None:
+        packet.flat[:] = [each.normal_force(data) for each in self._touches]
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         touch = self._touches[0]
@@ -264,8 +270,9 @@ class Lidar(Sensor):
     """
 
     kind = "lidar"
-    types = ("sensor_msgs/msg/LaserScan",)
+    types = ("sensor_msgs/msg/LaserScan", "float32[...]")
     sorts = ("site", "body")
+    axes = ("beams",)
     keys: ClassVar[Mapping[str, Key]] = MappingProxyType(
         {
             "beams": Key(360, "a number of beams from 2 to 100000", True, 2, 100_000),
@@ -288,6 +295,10 @@ class Lidar(Sensor):
                 problems.add(f"{self.declared.pointer}/{high}", text)
         angles = np.linspace(options["angle_min"], options["angle_max"], int(options["beams"]))
         self._beams = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
+        self.check_array(problems, "the ranges", len(angles))
+
+    def fill_array(self, packet: Packet, data: Any) -> None:
+        packet.flat[:] = self._ranges(data)
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         options, count = self.declared.options, len(self._beams)
@@ -296,6 +307,11 @@ class Lidar(Sensor):
         packet.angle_increment = (packet.angle_max - packet.angle_min) / (count - 1)
         packet.scan_time = 1 / self.declared.rate_hz
         packet.range_min, packet.range_max = options["range_min"], options["range_max"]
+        packet.ranges = array("f", self._ranges(data).tobytes())
+
+    def _ranges(self, data: Any) -> npt.NDArray[np.float32]:
+        """Shape (beams,), in metres."""
+        options, count = self.declared.options, len(self._beams)
         origins, axes = (data.xpos, data.xmat)
         if self._is_site:
             origins, axes = data.site_xpos, data.site_xmat
@@ -303,11 +319,11 @@ class Lidar(Sensor):
         found, hit = np.empty(count), np.empty(count, np.int32)
         mujoco.mj_multiRay(
             *(self.model, data, origins[self._index], beams.ravel(), None, 1, self._body),
-            *(hit, found, None, count, packet.range_max),
+            *(hit, found, None, count, options["range_max"]),
         )
-        found[(found < 0) | (found > packet.range_max)] = np.inf
-        found[found < packet.range_min] = -np.inf
-        packet.ranges = array("f", found.astype(np.float32).tobytes())
+        found[(found < 0) | (found > options["range_max"])] = np.inf
+        found[found < options["range_min"]] = -np.inf
+        return found.astype(np.float32)
 
 
 class _Pinhole(Sensor):
@@ -358,7 +374,8 @@ class Depth(_Pinhole):
     """
 
     kind = "depth"
-    types = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
+    types = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "float32[...]")
+    axes = ("height", "width")
     is_rendered = True
 
     def bind(self, problems: Problems) -> None:
@@ -366,6 +383,11 @@ class Depth(_Pinhole):
         width, height = self.declared.width, self.declared.height
         self._right = (np.arange(width, dtype=np.float32) - self._cx) / self._fx
         self._down = ((np.arange(height, dtype=np.float32) - self._cy) / self._fy)[:, None]
+        self.check_array(problems, "height and width", height, width)
+
+    def fill_array(self, packet: Packet, data: Any) -> None:
+        declared = self.declared
+        packet[:] = self.cameras.depth(data, self.elements[0][1], declared.width, declared.height)
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         width, height = self.declared.width, self.declared.height
@@ -393,13 +415,20 @@ class Depth(_Pinhole):
 
 
 class Camera(Sensor):
-    """A camera of the model, rgb8."""
+    """A camera of the model, rgb8; into an array: rows, columns and the three colours."""
 
     kind = "camera"
-    types = ("sensor_msgs/msg/Image",)
+    types = ("sensor_msgs/msg/Image", "uint8[...]")
     sorts = ("camera",)
     keys = PICTURE
+    axes = ("height", "width")
     is_rendered = True
+
+    def bind(self, problems: Problems) -> None:
+        self.check_array(problems, "pixels", self.declared.height, self.declared.width, 3)
+
+    def fill_array(self, packet: Packet, data: Any) -> None:
+        self.cameras.render(data, self.elements[0][1], packet)
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         width, height = self.declared.width, self.declared.height
@@ -418,6 +447,7 @@ class Clock(Sensor):
 
     kind = "clock"
     types = ("rosgraph_msgs/msg/Clock",)
+    needs_forward = False
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         packet.clock = to_stamp(nanoseconds=time_ns)
@@ -426,7 +456,7 @@ class Clock(Sensor):
 SENSORS: Mapping[str, type[Sensor]] = {
     sensor.kind: sensor
     for sensor in (
-        *(Imu, Pose, JointStates, Contacts, Reading, Lidar, Depth, CameraInfo, Transforms),
+        *(Imu, Pose, JointStates, Contacts, Reading, Data, Lidar, Depth, CameraInfo, Transforms),
         *(Camera, Clock),
     )
 }
@@ -453,14 +483,17 @@ def _sensor(port: Port, pointer: str, problems: Problems) -> SensorDeclaration |
         faults.add("sensor", f"{name!r} is not a kind of sensor{hint}")
         return None
     faults.unknown_keys(port.mujoco, ("sensor", "element", "rate", *sensor.keys))
-    if port.type not in sensor.types:
+    if form_of(port.type) not in sensor.types:
         types = " or ".join(sensor.types)
         faults.add("sensor", f"'{name}' fills {types}, but output '{port.name}' is a {port.type}")
     elements = _elements(port, sensor, faults)
     rate: Any = port.mujoco.get("rate")
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < float("inf"):
         faults.add("rate", f"{rate!r} is not a positive number (firings per simulated second)")
-    options = {key: port.mujoco.get(key, sensor.keys[key].default) for key in sensor.keys}
+    shape = port.array.shape if port.array else ()
+    defaults = {key: sensor.keys[key].default for key in sensor.keys}
+    defaults |= dict(zip(sensor.axes, shape, strict=False))
+    options = {key: port.mujoco.get(key, defaults[key]) for key in sensor.keys}
     for key, value in options.items():
         if not sensor.keys[key].holds(value):
             faults.add(key, f"{value!r} is not {sensor.keys[key].what}")
@@ -482,7 +515,7 @@ def _elements(port: Port, sensor: type[Sensor], faults: Faults) -> tuple[str, ..
         return (value,)
     elif not is_list_of_names(value):
         faults.add("element", f"{value!r} is neither a name nor a list of names")
-    elif port.type not in sensor.list_types:
+    elif form_of(port.type) not in sensor.list_types:
         hint = f"; a list needs {' or '.join(sensor.list_types)}" if sensor.list_types else ""
         faults.add("element", f"a {port.type} holds one element only{hint}")
     else:

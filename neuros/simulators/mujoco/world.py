@@ -110,9 +110,9 @@ class Declared:
 class World(Declared):
     """Physics in whole steps; the caller decides when to step.
 
-    A sensor is read by ``mj_forward`` at the state of its firing time, so that the reading and its
-    stamp belong together (right after ``mj_step`` MuJoCo's readings are one step old). The physics
-    is bit for bit the same with and without sensors.
+    A sensor is read at the state of its firing time, after ``mj_forward`` unless it measures the
+    state alone, so that the reading and its stamp belong together (right after ``mj_step`` MuJoCo's
+    readings are one step old). The physics is bit for bit that of ``mj_step`` without sensors.
 
     A declaration that names an element ``name/...`` waits until :meth:`spawn` adds that element;
     :meth:`require_bound` ends the waiting.
@@ -123,6 +123,7 @@ class World(Declared):
         problems = Problems(node.description.file)
         super().__init__(node.description, lambda: _load_spec(node, model), problems, fine=fine)
         self.data = mujoco.MjData(self.model)
+        self._warnings = self.data.warning.number
         if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
             import_opengl()  # raises now, not at the first image
         self.steps = 0
@@ -130,7 +131,7 @@ class World(Declared):
         self._fields = ModelFields(self.where)
         self._fields.apply(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
-        mujoco.mj_forward(self.model, self.data)
+        self._forward()
 
     @property
     def time_s(self) -> float:
@@ -156,27 +157,38 @@ class World(Declared):
         """Advance the physics; raises ``ModelError`` if it has become unstable."""
         mujoco.mj_step(self.model, self.data, nstep=count)
         self.steps += count
-        if self.data.warning.number.any():
+        if self._warnings.any():
             self._report_warnings(count)
 
     def sense(self, outputs: Iterable[str]) -> dict[str, Packet]:
         """The packets of these sensors for the present state."""
-        # mj_forward restarts the solver, which would change the next step.
+        sensors = {output: self._bound.sensors[output] for output in outputs}
+        if any(sensor.needs_forward for sensor in sensors.values()):
+            self._forward()
+        time_ns = self.time.nanoseconds(self.steps)
+        packets = {}
+        for output, sensor in sensors.items():
+            packet = packets[output] = self._node.make_packet(output)
+            if sensor.declared.array is None:
+                sensor.fill(packet, self.data, time_ns)
+            else:
+                sensor.fill_array(packet, self.data)
+        return packets
+
+    def _forward(self) -> None:
+        """Compute from the present state what sensors measure, without a change of the next step.
+
+        ``mj_forward`` restarts the solver, which would change that.
+        """
         solution = self.data.qacc_warmstart.copy()
         mujoco.mj_forward(self.model, self.data)
         self.data.qacc_warmstart[:] = solution
-        time_ns = self.time.nanoseconds(self.steps)
-        packets = {}
-        for output in outputs:
-            packet = packets[output] = self._node.make_packet(output)
-            self._bound.sensors[output].fill(packet, self.data, time_ns)
-        return packets
 
     def reset(self) -> None:
         """Back to time zero and the model's initial state; spawned entities stay."""
         self._fields.apply(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
-        mujoco.mj_forward(self.model, self.data)
+        self._forward()
         self.steps = 0
 
     def spawn(self, path: str, position: Sequence[float], name: str) -> None:
@@ -232,6 +244,7 @@ class World(Declared):
         old, before = self.model, self.data
         self.model, self.data = self._spec.recompile(old, before)
         self._fields = ModelFields(self.where)
+        self._warnings = self.data.warning.number
         self.cameras.use(self.model)
         self._bound = self._bind(self.model, Problems(self._node.description.file))
         mujoco.mj_forward(self.model, self.data)

@@ -38,8 +38,11 @@ from neuros_learn.nir.network_file import (
 Values: TypeAlias = NDArray[np.float32]
 _Step: TypeAlias = "Callable[[Values], Values]"
 _RESETS = ("subtract", "v_reset", "none")
-_TYPES = re.compile(r"std_msgs/msg/Float(32|64)(MultiArray)?")
-_TYPES_IN_WORDS = "std_msgs/msg/Float32MultiArray, Float32, Float64MultiArray or Float64"
+_TYPES = re.compile(r"std_msgs/msg/Float(32|64)(MultiArray)?|float(32|64)\[.*\]")
+_TYPES_IN_WORDS = (
+    "float32[...], float64[...], std_msgs/msg/Float32MultiArray, Float32, Float64MultiArray or"
+    " Float64"
+)
 # ROS itself declares these parameters.
 _OF_ROS = ("use_sim_time", "start_type_description_service")
 

@@ -27,7 +27,8 @@ def build(node: Any) -> None:
 def step(node: Any, *packets: Any) -> list[Any]:
     network, values = node.get_user_data(), {}
     for name, packet in zip(_INPUTS, packets, strict=True):
-        given, shape = np.asarray(packet.data, np.float32), network.inputs[name]
+        numbers = packet if isinstance(packet, np.ndarray) else packet.data
+        given, shape = np.asarray(numbers, np.float32), network.inputs[name]
         if given.size != np.prod(shape):
             text = f"input '{name}' has {given.size} values, and the network takes {shape}"
             raise NodeError(text)
@@ -36,7 +37,12 @@ def step(node: Any, *packets: Any) -> list[Any]:
     made = []
     for name in _OUTPUTS:
         packet, out = node.make_packet(name), found[name]
-        if isinstance(packet.data, array):
+        if isinstance(packet, np.ndarray):
+            if packet.size != out.size:
+                text = f"output '{name}' carries {packet.size} values"
+                raise NodeError(f"{text}, and the network gives {out.shape}")
+            packet.flat[:] = out.flat
+        elif isinstance(packet.data, array):
             code = packet.data.typecode
             packet.data = array(code, out.astype(code).tobytes())
         elif out.size == 1:
