@@ -26,7 +26,7 @@ from neuros.api.run_folder import make_run_folder, removed_folders, save_record,
 from neuros.api.run_record import EXIT_ENVIRONMENT, judge, run_record, run_table
 from neuros.backends.console import format_record
 from neuros.control import AtRest, Message, NodeStatus, Ready, Shutdown
-from neuros.errors import NeurosError, UsageError
+from neuros.errors import NeurosError, RunError, UsageError
 from neuros.launcher.outcome import EXIT_CODES, Outcome
 from neuros.launcher.quiescence import Declarations
 from neuros.node.context import ContextSwitch
@@ -237,9 +237,16 @@ class LocalRun:
 
     def interrupt(self, reason: str, exit_code: int) -> None:
         """End the run at once, with an exit code."""
-        if self._run is None:
-            self._outcome.fail(reason, exit_code)
-            self._finish()
+        if not _Thread.turn.acquire(blocking=False):
+            # A step that goes on in another thread ends before its next event.
+            self._loop.interrupt(RunError(f"the run has ended: {reason}", exit_code))
+            _Thread.turn.acquire()
+        try:
+            if self._run is None:
+                self._outcome.fail(reason, exit_code)
+                self._finish()
+        finally:
+            _Thread.turn.release()
 
     def wait(self) -> Run:
         """What the run, which has ended, has left behind."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 import logging
@@ -507,6 +508,18 @@ class TestFailures:
             shutil.rmtree(s.folder)
         assert s.close().exit_code == 4
         assert str(s.folder) in s.close().reason
+
+    def test_a_block_that_fails_ends_a_step_in_another_thread(self, tmp_path: Path) -> None:
+        async def give_up() -> Session:
+            with (
+                contextlib.suppress(asyncio.TimeoutError),
+                project_of(tmp_path, LOOKS_AT_ITS_PLACE).session() as s,
+            ):
+                await asyncio.wait_for(s.astep(until=lambda s: False), 0.05)
+            return s
+
+        assert asyncio.run(give_up()).close().reason == "the program failed: TimeoutError"
+        assert Path.cwd() == tmp_path
 
     def test_a_plugin_with_a_thread_takes_a_new_run_at_a_reset(self, tmp_path: Path) -> None:
         project = project_of(tmp_path, SENDS_FROM_A_THREAD)
