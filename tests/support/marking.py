@@ -39,6 +39,7 @@ REACHED = {
 BY_NAME = {
     "ros": (
         "api/test_arrays_in_programs.py::test_a_session",
+        "api/test_copies.py",
         "api/test_local_sessions.py",
         "api/test_python_api.py",
         "api/test_reset_settings.py",
