@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import Problem
@@ -96,10 +96,10 @@ def _nodes(parsed: ParsedProject) -> Iterator[Problem]:
 
 def copies_of(node: Element) -> int | None:
     """The number of copies of a node; ``None`` if it has none, or a wrong one."""
-    member = node.member("copies")
-    value = None if member is None else member.value
-    is_whole = isinstance(value, int | float) and not isinstance(value, bool) and value % 1 == 0
-    return int(value) if is_whole and value >= 1 else None
+    value: Any = getattr(node.member("copies"), "value", None)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return int(value) if value >= 1 and value % 1 == 0 else None
 
 
 def _copies(parsed: ParsedProject) -> Iterator[Problem]:
