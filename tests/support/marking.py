@@ -61,6 +61,7 @@ BY_NAME = {
         "extensions/neuros-learn/tests/test_datasets.py",
         "extensions/neuros-learn/tests/test_gym_environments.py",
         "extensions/neuros-learn/tests/test_gym_pictures.py",
+        "extensions/neuros-learn/tests/test_gym_vectors.py",
         "integration/",
         "upgrades/test_upgrades.py",
     ),
