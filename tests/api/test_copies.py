@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -262,3 +263,21 @@ def test_a_reset_gives_other_seeds(tmp_path: Path) -> None:
         session.reset(seed=1)
         assert np.array_equal(session["carts.state"].packet, first)
         assert not np.array_equal(second, first)
+
+
+# ---------------------------------------------------------------------- the page
+
+
+def test_the_carts_of_the_page_move(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "plugins.md").read_text("utf-8")
+    section = page.partition("### Many worlds\n")[2]
+    node, plugin = re.findall(r"```(?:json|python)\n(.*?)```", section, re.DOTALL)[:2]
+    (tmp_path / "carts.json").write_text(node)
+    (tmp_path / "carts.py").write_text(plugin)
+    with PluginHarness.from_node_file(tmp_path / "carts.json") as harness:
+        for _ in range(2):
+            harness.send("force", np.ones((64, 1)))
+            harness.run()
+        first, second = harness.received("state")
+    assert first.shape == (64, 2)
+    assert np.allclose(second - first, np.stack([0.01 * second[:, 1], np.full(64, 0.01)], axis=1))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+import runpy
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -226,14 +229,14 @@ def test_a_seed_gives_one_sequence_of_episodes(envs: Any) -> None:
 
 
 def test_settings_at_a_reset_hold_until_the_next_one(envs: Any) -> None:
-    def sixth_step(**options: Any) -> Any:
+    def second_step(**options: Any) -> Any:
         envs.reset(seed=1, options=options or None)
-        return [envs.step(np.ones((COPIES, 1)))[0] for _ in range(6)][-1]
+        return [envs.step(np.ones((COPIES, 1)))[0] for _ in range(2)][-1]
 
-    strong = sixth_step()
-    weak = sixth_step(set={"poles.model.actuator_gear": 2.0})
+    strong = second_step()
+    weak = second_step(set={"poles.model.actuator_gear": 2.0})
     assert np.all(weak[:, 2] < strong[:, 2])
-    assert np.array_equal(sixth_step(), strong)
+    assert np.array_equal(second_step(), strong)
     with pytest.raises(UsageError, match="there is no option 'reset_mask'"):
         envs.reset(options={"reset_mask": np.ones(COPIES, bool)})
 
@@ -390,3 +393,65 @@ def test_an_action_of_another_shape_is_refused(envs: Any) -> None:
     envs.reset(seed=1)
     with pytest.raises(UsageError, match=r"poles\.force takes 5 numbers, not 1"):
         envs.step(np.zeros(1))
+
+
+# ---------------------------------------------------------------------- the pages
+
+PAGES = Path(__file__).resolve().parents[3]
+
+
+def blocks(page: str) -> list[str]:
+    """The programs and node files of the section "Many worlds" of a page."""
+    text = (PAGES / page).read_text("utf-8").partition("### Many worlds\n")[2]
+    return re.findall(r"```(?:json|python)\n(.*?)```", text, re.DOTALL)
+
+
+@pytest.fixture
+def cheetahs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    model = Path(gymnasium.__file__).parent / "envs/mujoco/assets/half_cheetah.xml"
+    shutil.copy(model, tmp_path)
+    node, plugin = blocks("docs/simulators.md")[:2]
+    (tmp_path / "cheetahs.py").write_text(plugin)
+    (tmp_path / "project.json").write_text(f'{{"nodes": [{node}]}}')
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# Of Gymnasium's model.
+DEPRECATED = pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated")
+
+
+@DEPRECATED
+def test_the_cheetahs_of_the_page_are_bare_mujoco_bit_for_bit(cheetahs: Path) -> None:
+    envs = neuros.gym.make_vec(
+        cheetahs,
+        action="cheetahs.torques",
+        observation="cheetahs.joints",
+        reset="cheetahs.reset",
+        reward=lambda: 0,
+    )
+    seen, _ = envs.reset(seed=3)
+    model = mujoco.MjModel.from_xml_path("half_cheetah.xml")
+    bare = [mujoco.MjData(model) for _ in range(16)]
+    for index, data in enumerate(bare):
+        generator = np.random.default_rng(3 + index)
+        data.qpos[:] += generator.uniform(-0.1, 0.1, 9)
+        data.qvel[:] += 0.1 * generator.standard_normal(9)
+    for action in np.random.default_rng(1).uniform(-1, 1, (300, 16, 6)):
+        expected = [np.concatenate([data.qpos, data.qvel]) for data in bare]
+        assert seen.tobytes() == np.array(expected).tobytes()
+        seen = envs.step(action)[0]
+        for data, row in zip(bare, action, strict=True):
+            data.ctrl[:] = row
+            mujoco.mj_step(model, data, nstep=5)
+    envs.close()
+
+
+@DEPRECATED
+def test_the_program_of_the_page_says_what_it_says(
+    cheetahs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (program,) = blocks("extensions/neuros-learn/README.md")[:1]
+    (cheetahs / "program.py").write_text(program)
+    runpy.run_path(str(cheetahs / "program.py"))
+    assert capsys.readouterr().out.splitlines()[-1] == "(32, 18) (32,)"
