@@ -18,7 +18,7 @@ from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import Problem
 from neuros.project.dashboard import dashboard_mistakes
 from neuros.project.message_types import array_type, normalised, with_copies
-from neuros.project.model import Connection, Node
+from neuros.project.model import CLOCK_TYPE, Connection, Node
 from neuros.project.names import INTERNAL, MOST_CHARACTERS
 from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
 from neuros.project.plugin_files import PluginHook, Remark, plugins_of, read_plugin
@@ -103,11 +103,11 @@ def copies_of(node: Element) -> int | None:
 
 
 def _copies(parsed: ParsedProject) -> Iterator[Problem]:
-    """Ports of nodes with copies that have no room for an axis of copies."""
+    """Ports of nodes with copies that have no room for an axis of copies. Time is that of all."""
     for node in parsed.nodes:
         for port, side in _ports_of(node) if copies_of(node) is not None else ():
             written, hint = port.string("type") or "", _where(node, "copies")
-            if normalised(written) and array_type(written) is None:
+            if normalised(written) not in (None, CLOCK_TYPE) and array_type(written) is None:
                 text = f"each {side[:-1]} of a node with copies is an array, not {written}"
                 yield port.value["type"].problem(text, f"write it like 'float64[18]'; {hint}")
             if port.member("mujoco") is not None:

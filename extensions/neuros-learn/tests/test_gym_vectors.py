@@ -317,6 +317,37 @@ def test_actions_and_observations_may_have_parts(folder: Path) -> None:
     made.close()
 
 
+def test_a_clock_gives_all_copies_one_time(folder: Path) -> None:
+    plugin = PLUGIN.replace('outputs="joints"', 'outputs=["joints", "clock"]').replace(
+        'return worlds.read("qpos", "qvel")',
+        'clock = node.make_packet("clock")\n    clock.clock = node.now()\n'
+        '    return worlds.read("qpos", "qvel"), clock',
+    )
+    clock = {"name": "clock", "type": "rosgraph_msgs/msg/Clock"}
+    write(folder, plugin, outputs=[*NODE["outputs"], clock])
+    made = poles(folder, sim_s=0.1)
+    made.reset(seed=1)
+    *_, info = made.step(np.zeros((COPIES, 1)))
+    assert info["sim_time"].tolist() == [pytest.approx(0.1)] * COPIES
+    stamp = made.session["poles.clock"].packet.clock
+    assert (stamp.sec, stamp.nanosec) == (0, 100_000_000)
+    made.close()
+
+
+def test_gymnasium_makes_it_by_a_registered_name(folder: Path) -> None:
+    arguments = {**ARGUMENTS, "project": folder}
+    del arguments["num_envs"]
+    gymnasium.register(
+        "neuros/Poles-v0", vector_entry_point="neuros.gym:make_vec", kwargs=arguments
+    )
+    made = gymnasium.make_vec("neuros/Poles-v0", 3, vectorization_mode="vector_entry_point")
+    assert made.reset(seed=1)[0].shape == (3, 4)
+    assert made.spec is not None
+    assert made.spec.id == "neuros/Poles-v0"
+    made.close()
+    del gymnasium.registry["neuros/Poles-v0"]
+
+
 # ---------------------------------------------------------------------- the end
 
 

@@ -13,6 +13,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any
 
 import mujoco
@@ -133,7 +134,7 @@ class MuJoCoWorlds:
             going = np.flatnonzero(~anew).tolist()
             self._begin_anew(np.flatnonzero(anew).tolist())
         self._view.is_stepping = True
-        self._for_each(going, lambda model, data: mujoco.mj_step(model, data, count))
+        self._for_each(going, partial(mujoco.mj_step, nstep=count))
         self._view.is_stepping = False
         self._steps += count
         self._is_forward = False
