@@ -58,6 +58,7 @@ _NEWER = (
 )
 _MUJOCO = {
     "neuros.simulators.mujoco.MuJoCo",
+    "neuros.simulators.mujoco.MuJoCoWorlds",
     "neuros.simulators.mujoco.simulator.MuJoCo",
 }
 _Function: TypeAlias = "ast.FunctionDef | ast.AsyncFunctionDef"
@@ -129,7 +130,7 @@ class PluginFile:
         doubts: possible mistakes.
         imports: names of all imported modules.
         texts: all text constants.
-        model_arguments: the expressions given to ``MuJoCo`` as its model.
+        model_arguments: the expressions given to ``MuJoCo`` or ``MuJoCoWorlds`` as the model.
         sets_timestep: whether the plugin may change the timestep of a model.
         needs: the modules without which the plugin cannot be imported.
         is_whole: whether ``hooks`` has every hook, but for hooks of modules in ``functions_of``.

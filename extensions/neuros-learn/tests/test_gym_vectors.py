@@ -156,7 +156,7 @@ def actions(count: int) -> Any:
 # ---------------------------------------------------------------------- as Gymnasium's own
 
 
-@pytest.mark.parametrize("backend", ["local", "in-process"])
+@pytest.mark.parametrize("backend", ["local", "in-process", "process"])
 def test_it_is_the_sync_vector_of_the_same_environments_bit_for_bit(
     folder: Path, backend: str
 ) -> None:
