@@ -27,7 +27,7 @@ from functools import cache
 from types import MappingProxyType
 from typing import Any, TypeAlias, TypeVar
 
-from neuros.errors import HookError
+from neuros.errors import HookError, UsageError
 
 __all__ = [
     "All",
@@ -108,6 +108,7 @@ class HookSpec:
     Attributes:
         period_s: of a tick by the wall clock, in seconds.
         sim_period_s: of a tick by simulated time; a node runs it as a function of its clock.
+        is_batch: whether its arrays hold those of all copies of the node, along a leading axis.
     """
 
     kind: HookKind
@@ -116,6 +117,7 @@ class HookSpec:
     outputs: tuple[OutputSpec, ...] = ()
     period_s: float | None = None
     sim_period_s: float | None = None
+    is_batch: bool = False
 
     @property
     def name(self) -> str:
@@ -141,18 +143,20 @@ class HookSpec:
 
 
 def neuros_initialise(
-    inputs: Ports = None, outputs: Ports = None
+    inputs: Ports = None, outputs: Ports = None, *, batch: bool = False
 ) -> Callable[[_Function], _Function]:
     """Mark a hook that runs once, when every receiver of the node's outputs is there."""
-    return _marker(HookKind.INITIALISE, inputs, outputs)
+    return _marker(HookKind.INITIALISE, inputs, outputs, batch=batch)
 
 
-def neuros_reset(inputs: Ports = None, outputs: Ports = None) -> Callable[[_Function], _Function]:
+def neuros_reset(
+    inputs: Ports = None, outputs: Ports = None, *, batch: bool = False
+) -> Callable[[_Function], _Function]:
     """Mark a hook that runs in the place of the initialise hooks when a session resets the node.
 
     A plugin that has one stays loaded, with its user data.
     """
-    return _marker(HookKind.RESET, inputs, outputs)
+    return _marker(HookKind.RESET, inputs, outputs, batch=batch)
 
 
 def neuros_tick(
@@ -160,20 +164,29 @@ def neuros_tick(
     inputs: Ports = None,
     outputs: Ports = None,
     sim_seconds: float | None = None,
+    *,
+    batch: bool = False,
 ) -> Callable[[_Function], _Function]:
     """Mark a hook that runs every ``seconds`` of wall time from the end of initialisation on.
 
     With ``sim_seconds`` in its place: at every whole number of so many seconds of simulated time,
     by the packets of the node's clock, an input of type ``rosgraph_msgs/msg/Clock``.
     """
-    return _marker(HookKind.TICK, inputs, outputs, {"seconds": seconds, "sim_seconds": sim_seconds})
+    periods = {"seconds": seconds, "sim_seconds": sim_seconds}
+    return _marker(HookKind.TICK, inputs, outputs, periods, batch=batch)
 
 
 def neuros_function(
-    inputs: Ports = None, outputs: Ports = None
+    inputs: Ports = None, outputs: Ports = None, *, batch: bool = False
 ) -> Callable[[_Function], _Function]:
-    """Mark a hook that runs whenever its required inputs have a packet and its outputs are free."""
-    return _marker(HookKind.FUNCTION, inputs, outputs)
+    """Mark a hook that runs whenever its required inputs have a packet and its outputs are free.
+
+    Args:
+        inputs, outputs: names of ports, also in ``Optional`` and ``All``.
+        batch: the hook, as each other one with ports, is of a node with ``"copies"``: its arrays
+            are those of all copies, along a leading axis, ``(64, 18)``.
+    """
+    return _marker(HookKind.FUNCTION, inputs, outputs, batch=batch)
 
 
 def neuros_finalise() -> Callable[[_Function], _Function]:
@@ -203,6 +216,8 @@ def _marker(
     inputs: Ports,
     outputs: Ports,
     periods: Mapping[str, float | None] = MappingProxyType({}),
+    *,
+    batch: bool = False,
 ) -> Callable[[_Function], _Function]:
     bare = next((given for given in (inputs, *periods.values()) if callable(given)), None)
     if bare is not None:
@@ -224,12 +239,13 @@ def _marker(
                 tuple(map(output_of, _listed(outputs))),
                 period_s=period_s if name == "seconds" else None,
                 sim_period_s=period_s if name == "sim_seconds" else None,
+                is_batch=batch_of(batch),
             )
             for side, ports in (("input", spec.inputs), ("output", spec.outputs)):
                 names = [port.name for port in ports]
                 if twice := [each for each in names if names.count(each) > 1]:
                     raise ValueError(f"{side} '{twice[0]}' is named twice")
-        except ValueError as error:
+        except (ValueError, UsageError) as error:
             hook = getattr(function, "__name__", repr(function))
             raise HookError(str(error), hook=hook, where=_where(function)) from None
         if function.__module__ == "__main__":
@@ -301,6 +317,13 @@ def period_of(periods: Mapping[str, Any]) -> tuple[str, float]:
     if not (math.isfinite(seconds) and seconds > 0):
         raise ValueError(f"{name}={seconds!r} is not a positive time")
     return name, float(seconds)
+
+
+def batch_of(written: object) -> bool:
+    """The argument ``batch`` of a decorator. Raises ``UsageError`` if it is no truth value."""
+    if not isinstance(written, bool):
+        raise UsageError(f"batch={written!r}: write batch=True, or leave it out")
+    return written
 
 
 def _where(function: object) -> str:

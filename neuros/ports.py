@@ -276,6 +276,14 @@ class NodeContext(Protocol):
     def description(self) -> Node:
         """The declaration of the node: ports, ``mujoco`` keys, environment."""
 
+    @property
+    def copies(self) -> int:
+        """The number of worlds that each hook serves at once."""
+
+    @property
+    def seeds(self) -> list[int]:
+        """A seed for each copy. Raises ``NodeError`` if the node has no variable for a seed."""
+
     def make_packet(self, output: str) -> Packet:
         """A new message of the type of an output."""
 

@@ -123,6 +123,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "cli.live": {"tabulate"},
     "cli.runs": {"tabulate"},
     "replay.replayed_node": {"debugpy"},
+    "node.copies": {"numpy"},
     "recording": {"mcap", "rosbags", "psutil", "tabulate", "numpy", "xxhash"},
     "visualise": {"numpy"},
     "visualise.program": {"matplotlib", "numpy"},

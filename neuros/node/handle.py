@@ -12,6 +12,7 @@ from typing import Any
 
 from neuros.engine.engine import Engine
 from neuros.errors import ModelError, NodeError
+from neuros.node.copies import copy_seeds
 from neuros.node.failures import Failures, as_node_error
 from neuros.node.keeping import Keeping
 from neuros.node.simulated_time import SimulatedTime
@@ -156,6 +157,24 @@ class NodeHandle:
     def description(self) -> Node:
         """The node as its file declares it."""
         return self._file.node
+
+    @property
+    def copies(self) -> int:
+        """The number of worlds that each hook serves at once, ``"copies"`` of the node; else 1."""
+        return self._file.node.copies or 1
+
+    @property
+    def seeds(self) -> list[int]:
+        """A seed of 64 bits for each copy, for example for ``numpy.random.default_rng``.
+
+        They follow from the variable with SEED in its name in the environment of the node, by
+        ``numpy.random.SeedSequence``; that of a copy does not depend on how many there are. After
+        a reset with another seed they are other ones.
+
+        Raises:
+            NodeError: if the node has no such variable, several, or one that is no whole number.
+        """
+        return copy_seeds(self.name, self._file.node.environment, self.copies)
 
     @property
     def sim_time(self) -> float | None:

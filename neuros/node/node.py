@@ -379,6 +379,10 @@ class NodeRuntime:
         specs: Sequence[HookSpec] = hook_specs_of(dict(enumerate(node.hooks)))
         if not node.hooks:
             specs = load_plugin(node.plugin, self.name, node.module)
+        for spec in specs:
+            text, hint = node.misfit(spec.is_batch, bool(spec.inputs or spec.outputs))
+            if text:
+                raise HookError(f"{text}: {hint}", hook=spec.name, where=spec.where)
         self.specs = self._plugin = with_clocks(node, specs)
 
     def _make(self) -> Engine:

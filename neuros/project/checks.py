@@ -12,13 +12,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import Problem
 from neuros.project.dashboard import dashboard_mistakes
-from neuros.project.message_types import normalised
-from neuros.project.model import Connection, Node
+from neuros.project.message_types import array_type, normalised, with_copies
+from neuros.project.model import CLOCK_TYPE, Connection, Node
 from neuros.project.names import INTERNAL, MOST_CHARACTERS
 from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
 from neuros.project.plugin_files import PluginHook, Remark, plugins_of, read_plugin
@@ -58,7 +58,7 @@ _KNOWN_PREFIXES = (
 
 def mistakes(parsed: ParsedProject) -> list[Problem]:
     """All parts that do not fit together, at most ``MOST_PROBLEMS`` from each check."""
-    checks = (_nodes, _ports, _connections, dashboard_mistakes, _names, _parameters)
+    checks = (_nodes, _ports, _copies, _connections, dashboard_mistakes, _names, _parameters)
     return [problem for check in checks for problem in islice(check(parsed), MOST_PROBLEMS)]
 
 
@@ -92,6 +92,28 @@ def _nodes(parsed: ParsedProject) -> Iterator[Problem]:
         if other.string("name") != name:
             text = f"the node names '{other.string('name')}' and '{name}' differ only in case"
         yield node.value["name"].problem(text, _where(other, "name"))
+
+
+def copies_of(node: Element) -> int | None:
+    """The number of copies of a node; ``None`` if it has none, or a wrong one."""
+    value: Any = getattr(node.member("copies"), "value", None)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    return int(value) if value >= 1 and value % 1 == 0 else None
+
+
+def _copies(parsed: ParsedProject) -> Iterator[Problem]:
+    """Ports of nodes with copies that have no room for an axis of copies. Time is that of all."""
+    for node in parsed.nodes:
+        for port, side in _ports_of(node) if copies_of(node) is not None else ():
+            written, hint = port.string("type") or "", _where(node, "copies")
+            if normalised(written) not in (None, CLOCK_TYPE) and array_type(written) is None:
+                text = f"each {side[:-1]} of a node with copies is an array, not {written}"
+                yield port.value["type"].problem(text, f"write it like 'float64[18]'; {hint}")
+            if port.member("mujoco") is not None:
+                text = "sensors and actuators are of one world, and the node has copies"
+                hint = f"its plugin reads them from MuJoCoWorlds; {hint}"
+                yield port.value["mujoco"].key_problem(text, hint)
 
 
 def _ports(parsed: ParsedProject) -> Iterator[Problem]:
@@ -134,7 +156,9 @@ def _connections(parsed: ParsedProject) -> Iterator[Problem]:
 def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
     # By node and side, the ports by name; the name None says that others may be there.
     ports: dict[tuple[str, Side], dict[str | None, Element]] = {}
+    copies: dict[str | None, int | None] = {}
     for node in parsed.nodes:
+        copies.setdefault(node.string("name"), copies_of(node))
         for side in _SIDES:
             known = ports.setdefault((node.string("name") or "", side), {})
             member = node.member(side)
@@ -175,7 +199,11 @@ def _connection_ends(parsed: ParsedProject) -> Iterator[Problem]:
                     "cannot be connected",
                     _where(end, "external_topic"),
                 )
-        types = [normalised(port.string("type") or "") for port in found]
+        names = (connection.string(key) for key in (ENDS[0], ENDS[2]))
+        types = [
+            normalised(with_copies(port.string("type") or "", copies.get(name)))
+            for port, name in zip(found, names, strict=False)
+        ]
         if len(types) == 2 and None not in types and types[0] != types[1]:
             source, destination = found
             yield connection.problem(
@@ -387,6 +415,10 @@ def _misfits(
             hint = "connect the project's clock to it"
         if node.clock is None or not _is_fed(node, node.clock.name, connections):
             yield Remark(*hook.sim_tick, f"hook '{hook.name}': {text}", hint)
+    if hook.is_batch is not None:
+        text, hint = node.misfit(hook.is_batch, bool(hook.inputs or hook.outputs))
+        if text:
+            yield Remark(*hook.place, f"hook '{hook.name}': {text}", hint)
     for side, declared, known, others in (
         ("input", hook.inputs, node.inputs, node.outputs),
         ("output", hook.outputs, node.outputs, node.inputs),

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 from neuros.errors import Problem, ProjectError
 from neuros.project.checks import (
     container_in_place_of,
+    copies_of,
     is_for_gazebo,
     mistakes,
     plugin_problems,
@@ -24,6 +25,7 @@ from neuros.project.message_types import (
     MessagePackages,
     normalised,
     unknown_type,
+    with_copies,
     wrong_array,
 )
 from neuros.project.model import (
@@ -128,6 +130,7 @@ class _Builder:
             module=module,
             finalise_s=_if_valid(lambda: float(keys.get("finalise_s", FINALISE_S)), FINALISE_S),
             hooks=hooks,
+            copies=copies_of(element),
         )
 
     def _hooks(self, element: Element) -> tuple[Callable[..., Any], ...]:
@@ -170,15 +173,17 @@ class _Builder:
             return None
 
     def _ports(self, node: Element, side: str) -> tuple[Port, ...]:
-        must_be_here = self._is_like_this_machine(node)
+        must_be_here, copies = self._is_like_this_machine(node), copies_of(node)
         return tuple(
-            self._port(port, is_input=side == "inputs", must_be_here=must_be_here)
+            self._port(port, copies, is_input=side == "inputs", must_be_here=must_be_here)
             for port in node.items(side)
             if isinstance(port.value, dict)
         )
 
-    def _port(self, element: Element, *, is_input: bool, must_be_here: bool) -> Port:
-        written, keys = element.string("type") or "", element.plain
+    def _port(
+        self, element: Element, copies: int | None, *, is_input: bool, must_be_here: bool
+    ) -> Port:
+        written, keys = with_copies(element.string("type") or "", copies), element.plain
         type_name = normalised(written)
         unknown = wrong_array(written) or (
             type_name

@@ -131,6 +131,15 @@ class ArrayType(NamedTuple):
         kind = "UInt8" if self.dtype == "bool" else self.dtype.capitalize().replace("Uint", "UInt")
         return f"std_msgs/msg/{kind}MultiArray"
 
+    def of_copies(self, copies: int) -> ArrayType:
+        """The type of the arrays of all copies of a node, along a leading axis."""
+        return self._replace(shape=(copies, *self.shape))
+
+    @property
+    def of_one_copy(self) -> ArrayType:
+        """The type of one copy's array: the inverse of :meth:`of_copies`."""
+        return self._replace(shape=self.shape[1:])
+
     def __str__(self) -> str:
         return f"{self.dtype}[{','.join(map(str, self.shape))}]"
 
@@ -142,6 +151,12 @@ def array_type(type_name: str) -> ArrayType | None:
     if match is None or wrong_array(type_name):
         return None
     return ArrayType(match[1], tuple(map(int, match[2].split(","))))
+
+
+def with_copies(type_name: str, copies: int | None) -> str:
+    """The type of a port of a node with copies: an array gets a leading axis."""
+    array = None if copies is None else array_type(type_name)
+    return type_name if array is None or copies is None else str(array.of_copies(copies))
 
 
 def ros_type(type_name: str) -> str:

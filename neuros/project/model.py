@@ -30,6 +30,8 @@ _KEYS_OF_TRANSPORT = ("compression", "quality")
 FINALISE_S = 5.0
 MODEL_FIELDS = "NEUROS_MODEL_FIELDS"
 """A variable of nodes with a simulator: fields of its model, by name, as a JSON object."""
+SEEDS = "NEUROS_ENTROPY"
+"""A variable of nodes with copies: the seed of each copy, as a JSON list."""
 CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
 _UNITS = {"k": 1 << 10, "m": 1 << 20, "g": 1 << 30}
 
@@ -70,7 +72,8 @@ class Port:
 
     Attributes:
         name: unique among the inputs, or among the outputs, of its node.
-        type: message type in ROS notation, ``"std_msgs/msg/String"``, or ``"float64[18]"``.
+        type: message type in ROS notation, ``"std_msgs/msg/String"``, or ``"float64[18]"``; of a
+            node with copies with their axis, ``"float64[64,18]"``, which its file leaves out.
         external_topic: the plain ROS topic that it is bound to, as written, or ``None``;
             :meth:`Names.resolve` tells its full name.
         qos: of the external topic, or ``None`` if the file has none.
@@ -115,6 +118,7 @@ class Node:
         module: the plugin as a module of an installed package, else empty.
         finalise_s: seconds of finalisation without progress after which the node is killed.
         hooks: functions of this program that are the plugin; empty if it is a file. JSON has none.
+        copies: how many worlds each hook serves at once, ``None``: one, without an axis of copies.
     """
 
     name: str
@@ -134,6 +138,7 @@ class Node:
     module: str = ""
     finalise_s: float = FINALISE_S
     hooks: tuple[Callable[..., Any], ...] = ()
+    copies: int | None = None
 
     def input(self, name: str) -> Port:
         """The input of that name; raises ``KeyError``."""
@@ -166,6 +171,16 @@ class Node:
         if len(clocks) > 1:
             clocks = [port for port in clocks if port.name == "clock"]
         return clocks[0] if clocks else None
+
+    def misfit(self, is_batch: bool, has_ports: bool) -> tuple[str, str]:
+        """Why a hook does not fit the number of copies, and a hint; empty if it does."""
+        if is_batch and self.copies is None:
+            text = f"takes batches, but node '{self.name}' has no \"copies\""
+            return text, 'give it "copies": 1, or more'
+        if has_ports and not is_batch and self.copies is not None:
+            text = f"node '{self.name}' has {self.copies} copies, but the hook takes no batches"
+            return text, "write batch=True in its decorator: its arrays have a leading axis"
+        return "", ""
 
     @property
     def no_clock(self) -> tuple[str, str]:

@@ -21,8 +21,16 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import neuros.hooks
-from neuros.errors import Problem
-from neuros.hooks import HookSpec, InputSpec, hook_specs_of, input_of, output_of, period_of
+from neuros.errors import Problem, UsageError
+from neuros.hooks import (
+    HookSpec,
+    InputSpec,
+    batch_of,
+    hook_specs_of,
+    input_of,
+    output_of,
+    period_of,
+)
 from neuros.project.model import Node
 from neuros.project.scanner import display_name, read_bytes
 from neuros.project.suggest import did_you_mean
@@ -50,6 +58,7 @@ _NEWER = (
 )
 _MUJOCO = {
     "neuros.simulators.mujoco.MuJoCo",
+    "neuros.simulators.mujoco.MuJoCoWorlds",
     "neuros.simulators.mujoco.simulator.MuJoCo",
 }
 _Function: TypeAlias = "ast.FunctionDef | ast.AsyncFunctionDef"
@@ -89,6 +98,8 @@ class PluginHook:
         inputs, outputs: ``None`` where their number is computed.
         sim_tick: line and column of the period, for a tick by simulated time.
         kind: the name of the decorator, as ``neuros_tick``.
+        is_batch: whether it takes batches; ``None`` where that is computed.
+        place: line and column of the decorator.
     """
 
     name: str
@@ -96,6 +107,8 @@ class PluginHook:
     outputs: tuple[PluginPort, ...] | None
     sim_tick: tuple[int, int] | None = None
     kind: str = ""
+    is_batch: bool | None = False
+    place: tuple[int, int] = (1, 1)
 
 
 @dataclass(frozen=True)
@@ -117,7 +130,7 @@ class PluginFile:
         doubts: possible mistakes.
         imports: names of all imported modules.
         texts: all text constants.
-        model_arguments: the expressions given to ``MuJoCo`` as its model.
+        model_arguments: the expressions given to ``MuJoCo`` or ``MuJoCoWorlds`` as the model.
         sets_timestep: whether the plugin may change the timestep of a model.
         needs: the modules without which the plugin cannot be imported.
         is_whole: whether ``hooks`` has every hook, but for hooks of modules in ``functions_of``.
@@ -169,6 +182,8 @@ def read_functions(functions: Sequence[Callable[..., Any]]) -> list[PluginFile]:
                 tuple(PluginPort(p.name, *place, False, p.is_optional) for p in spec.outputs),
                 None if spec.sim_period_s is None else place,
                 f"neuros_{spec.kind.value}",
+                spec.is_batch,
+                place,
             )
         )
         _Reader.check_source(plugin, spec)
@@ -411,7 +426,7 @@ class _Reader:
         plugin.sends_by_itself |= any(each.attr in _SENDERS for each in attributes)
 
     def _hook(self, function: _Function, decorator: ast.expr, kind: str) -> PluginHook:
-        unknown = PluginHook(function.name, None, None, kind=kind)
+        unknown = PluginHook(function.name, None, None, kind=kind, is_batch=None)
         if not isinstance(decorator, ast.Call):
             self._fail(function, decorator, f"@{kind} needs parentheses")
             return unknown
@@ -439,7 +454,19 @@ class _Reader:
             self._ports(function, given.get("outputs"), "output"),
             self._sim_tick(function, decorator, given) if kind == "neuros_tick" else None,
             kind,
+            self._is_batch(function, given.get("batch")),
+            (decorator.lineno, decorator.col_offset + 1),
         )
+
+    def _is_batch(self, function: _Function, written: ast.expr | None) -> bool | None:
+        """Whether the hook takes batches, ``None`` where that is computed."""
+        try:
+            return batch_of(False if written is None else ast.literal_eval(written))
+        except UsageError as error:
+            self._fail(function, written or function, str(error))
+        except (TypeError, ValueError):
+            pass
+        return None
 
     def _sim_tick(
         self, function: _Function, decorator: ast.expr, given: Mapping[str, ast.expr]

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from neuros.project.message_types import with_copies
 from neuros.project.model import (
     FINALISE_S,
     Budgets,
@@ -74,7 +75,7 @@ def node_file_text(node_file: NodeFile) -> str:
 def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
     """The inverse of :func:`node_file_to_json`; raises ``KeyError`` for anything else."""
     node = content["node"]
-    script = node.get("script")
+    script, copies = node.get("script"), node.get("copies")
     module = node["plugin"] if is_module_name(node["plugin"]) else ""
     names = names_from(content.get("namespace", ""), content.get("remap", {}))
     return NodeFile(
@@ -84,8 +85,8 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
             plugin=(find_module(module) or Path()) if module else Path(node["plugin"]),
             module=module,
             script=None if script is None else Path(script),
-            inputs=tuple(_port(port, is_input=True) for port in node.get("inputs", ())),
-            outputs=tuple(_port(port, is_input=False) for port in node.get("outputs", ())),
+            inputs=tuple(_port(port, copies, is_input=True) for port in node.get("inputs", ())),
+            outputs=tuple(_port(port, copies, is_input=False) for port in node.get("outputs", ())),
             environment=dict(node.get("environment", {})),
             file=Path(content["file"]),
             pointer=content["pointer"],
@@ -95,6 +96,7 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
             access=access_of(node),
             parameters=parameters_of(node.get("parameters", {})),
             finalise_s=node.get("finalise_s", FINALISE_S),
+            copies=copies,
         ),
         connections=tuple(
             Connection.of(keys, namespace=names.namespace) for keys in content["connections"]
@@ -173,25 +175,29 @@ def _node_keys(node: Node) -> dict[str, Any]:
         **keys_of(node.resources, node.access),
         "parameters": parameters_to_json(node.parameters),
         "finalise_s": 0 if node.finalise_s == FINALISE_S else node.finalise_s,
+        "copies": node.copies,
     }
     return {
         "name": node.name,
         "container": node.container,
         "plugin": node.module or str(node.plugin),
         **{key: value for key, value in optional.items() if value},
-        "inputs": [_port_keys(port) for port in node.inputs],
-        "outputs": [_port_keys(port) for port in node.outputs],
+        "inputs": [_port_keys(port, node.copies) for port in node.inputs],
+        "outputs": [_port_keys(port, node.copies) for port in node.outputs],
     }
 
 
-def _port(keys: Mapping[str, Any], *, is_input: bool) -> Port:
+def _port(keys: Mapping[str, Any], copies: int | None, *, is_input: bool) -> Port:
     port = Port(**{key: value for key, value in keys.items() if key != "qos"})
+    port = replace(port, type=with_copies(port.type, copies))
     return replace(port, qos=qos_of(keys["qos"], is_input=is_input)) if "qos" in keys else port
 
 
-def _port_keys(port: Port) -> dict[str, Any]:
+def _port_keys(port: Port, copies: int | None) -> dict[str, Any]:
     qos = None if port.qos is None else qos_to_json(port.qos)
     keys = {**vars(port), "mujoco": dict(port.mujoco) or None, "qos": qos}
+    if copies is not None and port.array:
+        keys["type"] = str(port.array.of_one_copy)
     return {key: value for key, value in keys.items() if value is not None}
 
 

@@ -183,6 +183,7 @@ class PluginHarness:
         connections: those that differ, ``wire("camera.image -> node.view", discard_limit=3)``.
         environment: environment variables of the node.
         name: the node's name.
+        copies: its number of copies; the types of the ports are those of one.
         run_folder: the run folder, a temporary one if not given.
         restore: values that the plugin gets back by ``node.keep``, by name.
 
@@ -201,6 +202,7 @@ class PluginHarness:
         connections: Sequence[Connection] = (),
         environment: Mapping[str, str] | None = None,
         name: str = "node",
+        copies: int | None = None,
         run_folder: Path | None = None,
         restore: Mapping[str, Any] | None = None,
     ) -> None:
@@ -219,12 +221,13 @@ class PluginHarness:
             name=name,
             container="neuros_python",
             plugin=path,
-            inputs=ports(inputs or {}),
-            outputs=ports(outputs or {}),
+            inputs=ports(inputs or {}, copies),
+            outputs=ports(outputs or {}, copies),
             environment=dict(environment or {}),
             file=path,
             module=module,
             hooks=hooks,
+            copies=copies,
         )
         wires = with_neighbours(node, connections)
         project = path.parent if path.exists() else Path.cwd()

@@ -9,7 +9,7 @@ from typing import Any
 
 from neuros.errors import NodeError
 from neuros.ports import Inbox, Logger
-from neuros.project.message_types import in_full, normalised, wrong_array
+from neuros.project.message_types import in_full, normalised, with_copies, wrong_array
 from neuros.project.model import Connection, Node, NodeFile, Port, Value
 from neuros.runtime.local import (
     LocalLoop,
@@ -173,7 +173,7 @@ def wire(text: str, discard_limit: int | None = None, queue_size: int = 1) -> Co
     return Connection(source, output, destination, input_name, discard_limit, queue_size)
 
 
-def ports(types: Mapping[str, str]) -> tuple[Port, ...]:
+def ports(types: Mapping[str, str], copies: int | None = None) -> tuple[Port, ...]:
     """Ports from their names and message types, in either notation."""
     found = []
     for name, written in types.items():
@@ -184,7 +184,7 @@ def ports(types: Mapping[str, str]) -> tuple[Port, ...]:
                 "write it like 'std_msgs/msg/String'",
             )
             raise ValueError(f"'{name}': {text}{hint and f': {hint}'}")
-        found.append(Port(name, type_name))
+        found.append(Port(name, with_copies(type_name, copies)))
     return tuple(found)
 
 

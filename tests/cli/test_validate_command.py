@@ -78,9 +78,15 @@ def test_what_is_not_known_of_the_model_is_no_problem(plugin: str) -> None:
     assert main(["validate", "."]) == 0
 
 
-def test_a_model_that_is_none_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("simulator", "keys"), [("MuJoCo", {"outputs": [IMU]}), ("MuJoCoWorlds", {"copies": 3})]
+)
+def test_a_model_that_is_none_is_named(
+    simulator: str, keys: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
     Path("box.xml").write_text("<mujoco><bodi/></mujoco>")
-    write(f"{HEAD}{HOOK}MuJoCo(node, 'box.xml')", outputs=[IMU])
+    head = HEAD.replace("import MuJoCo\n", f"import {simulator}\n")
+    write(f"{head}{HOOK}{simulator}(node, 'box.xml')", **keys)
     assert main(["validate", "."]) == 3
     assert capsys.readouterr().err.startswith("box.xml:1:1: the model does not compile: ")
 

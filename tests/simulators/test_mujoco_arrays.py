@@ -15,7 +15,7 @@ from simulated_node import SimulatedNode
 
 from neuros.errors import ModelError
 from neuros.simulators.mujoco import MuJoCo
-from neuros.simulators.mujoco.readings import _COMPUTED, _STATE
+from neuros.simulators.mujoco.readings import _COMPUTED, STATE
 
 HOPPER = """
 <mujoco>
@@ -153,7 +153,7 @@ def test_a_packet_is_its_own() -> None:
     assert sim.data.qpos.any()
 
 
-@pytest.mark.parametrize("name", [*_STATE, *_COMPUTED])
+@pytest.mark.parametrize("name", [*STATE, *_COMPUTED])
 def test_every_array_of_mjdata_can_be_sent(name: str) -> None:
     model = mujoco.MjModel.from_xml_string(HOPPER)
     size = np.size(getattr(mujoco.MjData(model), name))
@@ -319,4 +319,4 @@ def test_a_wrong_command_is_told_by_its_place(type_: str, keys: Any, text: str) 
 
 def test_the_page_names_every_array() -> None:
     page = (Path(__file__).parents[2] / "docs" / "simulators.md").read_text("utf-8")
-    assert [name for name in (*_STATE, *_COMPUTED) if f"`{name}`" not in page] == []
+    assert [name for name in (*STATE, *_COMPUTED) if f"`{name}`" not in page] == []

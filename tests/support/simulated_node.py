@@ -77,6 +77,7 @@ class SimulatedNode:
         inputs: Mapping[str, tuple[str, dict[str, Any]]] | None = None,
         folder: Path = Path("/nowhere"),
         environment: Mapping[str, str] | None = None,
+        copies: int | None = None,
     ) -> None:
         self.description = Node(
             name="robot",
@@ -86,7 +87,10 @@ class SimulatedNode:
             outputs=_ports(outputs or {}),
             environment=dict(environment or {}),
             file=folder / "robot.json",
+            copies=copies,
         )
+        self.copies = copies or 1
+        self.seeds = [*range(self.copies)]
         self.name = "robot"
         self.run_dir = folder
         self.log = Log()

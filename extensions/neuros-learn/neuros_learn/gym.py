@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import reduce
 from math import prod
 from pathlib import Path
@@ -21,10 +23,10 @@ from typing import Any, SupportsFloat
 import numpy as np
 
 from neuros.api.project import Project
-from neuros.api.session import check_length
+from neuros.api.session import Session, check_length
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.project.model import Port
+from neuros.project.model import SEEDS, Port
 from neuros.project.model import Project as Described
 from neuros.project.suggest import did_you_mean
 from neuros.recording.provenance import seeds
@@ -36,6 +38,8 @@ try:
     import gymnasium
     from gymnasium import logger, spaces
     from gymnasium.envs.registration import EnvSpec
+    from gymnasium.vector import AutoresetMode
+    from gymnasium.vector.utils import batch_space
 except ModuleNotFoundError as error:
     raise EnvironmentFault(
         f"neuros.gym needs Gymnasium, which is not installed here: {install_command('rl')}"
@@ -93,6 +97,30 @@ def make(
     return gymnasium.make(spec, max_episode_steps, project=loaded, **arguments)
 
 
+def make_vec(project: str | os.PathLike[str] | Project, **arguments: Any) -> ProjectVectorEnv:
+    """A vector environment of the copies of a project's nodes: one hook steps all of them.
+
+    ::
+
+        envs = neuros.gym.make_vec(
+            "project.json",
+            num_envs=16,
+            action="cheetahs.torques",
+            observation="cheetahs.joints",
+            reset="cheetahs.reset",
+            reward=lambda previous_observation, observation: observation[:, 9],
+            max_episode_steps=1000,
+        )
+
+    Args:
+        project, arguments: as of :class:`ProjectVectorEnv`.
+
+    Raises:
+        UsageError: as the class.
+    """
+    return ProjectVectorEnv(project, **arguments)
+
+
 def register(
     env_id: str,
     project: str | os.PathLike[str] | Project,
@@ -125,7 +153,131 @@ def register(
     )
 
 
-class ProjectEnv(gymnasium.Env[Any, Any]):
+class _World:
+    """A project that an environment steps: its session, and its actions and observations by name.
+
+    Attributes:
+        session: the run.
+        action, observation: those of the last step.
+    """
+
+    session: Session
+
+    def _open(
+        self,
+        project: Project,
+        described: Described,
+        *,
+        action: str | Sequence[str],
+        observation: str | Sequence[str],
+        functions: Mapping[str, Callable[..., Any]],
+        ranges: Mapping[str, tuple[Any, Any]] | None,
+        length: tuple[int | None, float | None],
+        initial_action: Any,
+        options: Mapping[str, Any],
+        model: str | os.PathLike[str] | None = None,
+        copies: int | None = None,
+        also_taken: Sequence[str] = (),
+    ) -> None:
+        """Find all names, and begin the session.
+
+        Args:
+            project, described: the project.
+            functions: those of the user, by their role.
+            length: of a step, in rounds or simulated seconds.
+            copies: of arrays whose first axis is that of copies, their number.
+            also_taken: further inputs to take over.
+        """
+        self._functions = {name: _by_names(name, each) for name, each in functions.items()}
+        self._rounds, self._sim_s = length
+        self._initial_action = initial_action
+        self._has_seeds = bool(seeds(described.nodes))
+        taken = [
+            end for name in _listed(action) for end in _inputs_behind(described, _split(name)[0])
+        ]
+
+        def resolve() -> None:
+            """Find the numbers of all actions and observations."""
+            controls = {} if model is None else _controls(described, project.file.parent / model)
+            given = ranges or {}
+            self._actions = [
+                _numbers(described, name, given, controls, copies=copies)
+                for name in _listed(action)
+            ]
+            self._observations = [
+                _numbers(described, name, given, is_output=True, copies=copies)
+                for name in _listed(observation)
+            ]
+            names = [each.name for each in (*self._actions, *self._observations)]
+            if unknown := given.keys() - {*names}:
+                raise UsageError(f"ranges: '{min(unknown)}' is none of {', '.join(names)}")
+
+        # Reports mistakes before a session starts; types that the project builds exist only later.
+        with contextlib.suppress(EnvironmentFault):
+            resolve()
+        self.session = project.session(take_over=[*taken, *also_taken], **options)
+        try:
+            resolve()
+        except BaseException:
+            self.session.close()
+            raise
+        self._outputs = {each.port: self.session[each.port] for each in self._observations}
+        self._has_one_action = isinstance(action, str)
+        self._has_one_observation = isinstance(observation, str)
+        self.action: Any = None
+        self.observation: Any = None
+
+    def _begin(self, seed: int | None, changes: Mapping[str, Any]) -> None:
+        """Reset the session with a seed and settings, and run until all outputs have sent."""
+        self.session.reset(seed=seed, **changes)
+        if self._initial_action is not None:
+            self._send(self._initial_action)
+        for _ in range(_MOST_ROUNDS):
+            silent = [output for output in self._outputs.values() if not output.count]
+            if not silent:
+                self.action, self.observation = None, self._observe()
+                return
+            self.session.step()
+        raise UsageError(
+            f"{silent[0].name} has sent nothing in {_MOST_ROUNDS} rounds after a reset: if the"
+            " project waits for a first command, give initial_action"
+        )
+
+    def _advance(self, action: Any) -> tuple[bool, dict[str, Any]]:
+        """Send the action, step the project, and observe.
+
+        Returns:
+            Whether the project goes on, and what the user's functions are given.
+        """
+        self._send(action)
+        goes_on = self.session.step(self._rounds, sim_s=self._sim_s)
+        before, self.action, self.observation = self.observation, action, self._observe()
+        return goes_on, self._seen(before)
+
+    def _send(self, action: Any) -> None:
+        for each in self._actions:
+            message = each.message(action if self._has_one_action else action[each.name])
+            for end in each.inputs:
+                self.session.send(end, message)
+
+    def _observe(self) -> Any:
+        packets = {name: output.packet for name, output in self._outputs.items()}
+        found = {each.name: each.read(packets[each.port]) for each in self._observations}
+        return next(iter(found.values())) if self._has_one_observation else found
+
+    def _seen(self, before: Any) -> dict[str, Any]:
+        """What the user's functions are given, by :data:`_SEEN`."""
+        values = (self.observation, before, self.action, self.session, self)
+        return dict(zip(_SEEN, values, strict=True))
+
+    def _information(self, seen: Mapping[str, Any]) -> dict[str, Any]:
+        sim_time, own = self.session.sim_time, self._functions["info"](seen)
+        if not isinstance(own, Mapping):
+            raise UsageError(f"info returned {own!r}, which is no mapping")
+        return {**({} if sim_time is None else {"sim_time": sim_time}), **own}
+
+
+class ProjectEnv(_World, gymnasium.Env[Any, Any]):
     """An environment whose world is a project.
 
     A name is ``node.port``, for its array, or all numbers of its message (without texts and time
@@ -190,15 +342,6 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
     ) -> None:
         _check_names(options)
         count = check_length(rounds, sim_s)
-        self._reward, self._done, self._truncated, self._info = (
-            _by_names(role, function)
-            for role, function in (
-                ("reward", reward),
-                ("done", done),
-                ("truncated", truncated),
-                ("info", info),
-            )
-        )
         loaded = project if isinstance(project, Project) else Project.from_file(project)
         described = loaded.check_with({}, is_held=True)
         self._camera = _camera(described, render_mode, render)
@@ -207,27 +350,20 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         if self._camera is not None:
             fps = _steps_per_s(described, count, sim_s)
             self.metadata = {"render_modes": [_RENDER_MODE], "render_fps": fps}
-        self._rounds, self._sim_s, self._initial_action = rounds, sim_s, initial_action
-        self._has_seeds = bool(seeds(described.nodes))
-        taken = [
-            end for name in _listed(action) for end in _inputs_behind(described, _split(name)[0])
-        ]
-        # Reports mistakes before a session starts; types that the project builds exist only later.
-        with contextlib.suppress(EnvironmentFault):
-            self._resolve_names(loaded, described, action, observation, ranges or {}, model)
-        self.session = loaded.session(backend=backend, take_over=taken, **options)
-        try:
-            self._resolve_names(loaded, described, action, observation, ranges or {}, model)
-        except BaseException:
-            self.session.close()
-            raise
-        self._outputs = {each.port: self.session[each.port] for each in self._observations}
-        self._has_one_action = isinstance(action, str)
-        self._has_one_observation = isinstance(observation, str)
+        self._open(
+            loaded,
+            described,
+            action=action,
+            observation=observation,
+            functions={"reward": reward, "done": done, "truncated": truncated, "info": info},
+            ranges=ranges,
+            length=(rounds, sim_s),
+            initial_action=initial_action,
+            options={"backend": backend, **options},
+            model=model,
+        )
         self.action_space = _space(self._actions, is_one=self._has_one_action)
         self.observation_space = _space(self._observations, is_one=self._has_one_observation)
-        self.action: Any = None
-        self.observation: Any = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -243,33 +379,19 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         changes = _changes(options)
         super().reset(seed=seed)
         episode = int(self.np_random.integers(_SEEDS)) if self._has_seeds else None
-        self.session.reset(seed=episode, **changes)
-        if self._initial_action is not None:
-            self._send(self._initial_action)
-        for _ in range(_MOST_ROUNDS):
-            silent = [output for output in self._outputs.values() if not output.count]
-            if not silent:
-                self.action, self.observation = None, self._observe()
-                return self.observation, self._information(self._seen(None))
-            self.session.step()
-        raise UsageError(
-            f"{silent[0].name} has sent nothing in {_MOST_ROUNDS} rounds after a reset: if the"
-            " project waits for a first command, give initial_action"
-        )
+        self._begin(episode, changes)
+        return self.observation, self._information(self._seen(None))
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """Send the action, step the project, and observe. Raises ``RunError`` if it fails."""
-        self._send(action)
-        goes_on = self.session.step(self._rounds, sim_s=self._sim_s)
-        before, self.action, self.observation = self.observation, action, self._observe()
-        seen = self._seen(before)
-        is_over = not goes_on or bool(self._done(seen))
-        reward = self._reward(seen)
+        goes_on, seen = self._advance(action)
+        is_over = not goes_on or bool(self._functions["done"](seen))
+        reward = self._functions["reward"](seen)
         try:
             gained = float(reward)
         except (TypeError, ValueError):
             raise UsageError(f"reward returned {reward!r}, which is no number") from None
-        is_cut = bool(self._truncated(seen))
+        is_cut = bool(self._functions["truncated"](seen))
         return self.observation, gained, is_over, is_cut, self._information(seen)
 
     def render(self) -> Any:
@@ -298,48 +420,219 @@ class ProjectEnv(gymnasium.Env[Any, Any]):
         """End the run, drained."""
         self.session.close()
 
-    # ------------------------------------------------------------------ inside
 
-    def _resolve_names(
+class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
+    """The copies of the nodes of a project, as environments that are stepped at once.
+
+    The arguments are those of :class:`ProjectEnv`, without ``model`` and pictures. Values have a
+    leading axis of ``num_envs``: actions, observations, and those that the functions are given and
+    return. As in Gymnasium's own vectors, an environment whose episode is over begins the next one
+    in the step after that: its action is ignored, and its reward is 0.
+
+    Args:
+        project: its file, its folder, or a :class:`~neuros.api.project.Project`.
+        num_envs: the ``"copies"`` of all nodes that have this key; ``None``: those of the project.
+        reset: an input ``bool[1]`` of a node with copies; each step sends to it which copies begin
+            anew in the place of their step.
+        action, observation: ports of nodes with copies.
+        reward, done, truncated, info: functions; each returns an array with a value for each copy,
+            or one for all, ``info`` a mapping of such.
+        max_episode_steps: the number of steps after which an episode is ``truncated``.
+        ranges, rounds, sim_s, initial_action, backend, options: as of :class:`ProjectEnv`.
+
+    Attributes:
+        session: the run.
+        action, observation: those of the last step.
+
+    Raises:
+        UsageError: as :class:`ProjectEnv`; no node of the project has copies, or they differ.
+        ProjectError, EnvironmentFault, RunError: as a session does.
+    """
+
+    _over: Any
+    """Whose episode has ended with the last step."""
+    _steps: Any
+    """Steps of each episode."""
+
+    def __init__(
         self,
-        project: Project,
-        described: Described,
+        project: str | os.PathLike[str] | Project,
+        *,
+        num_envs: int | None = None,
+        reset: str,
         action: str | Sequence[str],
         observation: str | Sequence[str],
-        ranges: Mapping[str, tuple[Any, Any]],
-        model: str | os.PathLike[str] | None,
+        reward: Callable[..., Any],
+        done: Callable[..., Any] = lambda: False,
+        truncated: Callable[..., Any] = lambda: False,
+        info: Callable[..., Mapping[str, Any]] = lambda: _NOTHING,
+        max_episode_steps: int | None = None,
+        ranges: Mapping[str, tuple[Any, Any]] | None = None,
+        rounds: int | None = None,
+        sim_s: float | None = None,
+        initial_action: Any = None,
+        backend: str = "local",
+        **options: Any,
     ) -> None:
-        """Find the numbers of all actions and observations. Raises as the class."""
-        controls = {} if model is None else _controls(described, project.file.parent / model)
-        self._actions = [_numbers(described, name, ranges, controls) for name in _listed(action)]
-        self._observations = [
-            _numbers(described, name, ranges, is_output=True) for name in _listed(observation)
-        ]
-        names = [each.name for each in (*self._actions, *self._observations)]
-        if unknown := ranges.keys() - {*names}:
-            raise UsageError(f"ranges: '{min(unknown)}' is none of {', '.join(names)}")
+        _check_names(options, ProjectVectorEnv)
+        _check_steps(max_episode_steps)
+        check_length(rounds, sim_s)
+        loaded, self._copied = _with_copies(project, num_envs)
+        described = loaded.check_with({}, is_held=True)
+        self.num_envs = described.node(self._copied[0]).copies or 1
+        self._masked = _inputs_behind(described, reset)
+        for type_ in {_port(described, name).type for name in self._masked}:
+            if type_ != f"bool[{self.num_envs},1]":
+                raise UsageError(
+                    f"reset='{reset}': give an input with the type bool[1], of a node with copies,"
+                    f" not {type_}"
+                )
+        self._open(
+            loaded,
+            described,
+            action=action,
+            observation=observation,
+            functions={"reward": reward, "done": done, "truncated": truncated, "info": info},
+            ranges=ranges,
+            length=(rounds, sim_s),
+            initial_action=initial_action,
+            options={"backend": backend, **options},
+            copies=self.num_envs,
+            also_taken=self._masked,
+        )
+        self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+        self.single_action_space = _space(self._actions, is_one=self._has_one_action)
+        self.single_observation_space = _space(self._observations, is_one=self._has_one_observation)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self._most_steps = max_episode_steps
+        self._has_ended = False
+        self._begin_all()
 
-    def _send(self, action: Any) -> None:
-        for each in self._actions:
-            message = each.message(action if self._has_one_action else action[each.name])
-            for end in each.inputs:
-                self.session.send(end, message)
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in each environment.
 
-    def _observe(self) -> Any:
-        packets = {name: output.packet for name, output in self._outputs.items()}
-        found = {each.name: each.read(packets[each.port]) for each in self._observations}
-        return next(iter(found.values())) if self._has_one_observation else found
+        Args:
+            seed: ``1``: environment i has the seed 1 + i, as in Gymnasium's own vectors; or one for
+                each; ``None``: the next ones. A node has them as ``node.seeds``.
+            options: ``{"set": {...}}``: settings, as for :meth:`Session.reset`.
 
-    def _seen(self, before: Any) -> dict[str, Any]:
-        """What the user's functions are given, by :data:`_SEEN`."""
-        values = (self.observation, before, self.action, self.session, self)
-        return dict(zip(_SEEN, values, strict=True))
+        Raises:
+            UsageError: an observed output does not send, there is another option, or another number
+                of seeds.
+        """
+        changes = _changes(options)
+        count = self.num_envs
+        wanted: Sequence[int | None]
+        if seed is None or isinstance(seed, int | np.integer):
+            super().reset(seed=None if seed is None else int(seed))
+            wanted = [None if seed is None else int(seed) + index for index in range(count)]
+        else:
+            wanted = list(seed)
+            if len(wanted) != count:
+                raise UsageError(f"reset: give {count} seeds, one for each copy, not {len(wanted)}")
+            first = next((each for each in wanted if each is not None), None)
+            super().reset(seed=first)
+        drawn = self.np_random.integers(_SEEDS, size=count + 1).tolist()
+        own = [new if each is None else int(each) for each, new in zip(wanted, drawn, strict=False)]
+        variables = {f"nodes.{name}.environment.{SEEDS}": json.dumps(own) for name in self._copied}
+        settings = {**variables, **changes.get("set", {})}
+        self._begin(drawn[-1] if self._has_seeds else None, {"set": settings})
+        self._begin_all()
+        return self.observation, self._information(self._seen(None))
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Step all environments; those whose episode was over begin the next one.
+
+        Raises ``RunError`` if the project fails.
+        """
+        if self._has_ended:
+            observation, information = self.reset()
+            zeros = np.zeros(self.num_envs)
+            return observation, zeros, zeros > 0, zeros > 0, information
+        anew = self._over
+        for name in self._masked:
+            self.session.send(name, anew[:, None])
+        goes_on, seen = self._advance(actions)
+        rewards = self._values("reward", seen, float)
+        terminations = self._values("done", seen, bool)
+        truncations = self._values("truncated", seen, bool)
+        self._steps += 1
+        if self._most_steps is not None:
+            truncations |= self._steps >= self._most_steps
+        if anew.any():
+            self._steps[anew] = 0
+            rewards[anew], terminations[anew], truncations[anew] = 0.0, False, False
+        if not goes_on:
+            self._has_ended = True
+            terminations[:] = True
+        self._over = terminations | truncations
+        return self.observation, rewards, terminations, truncations, self._information(seen)
+
+    def close_extras(self, **_: Any) -> None:
+        """End the run, drained."""
+        self.session.close()
+
+    def _begin_all(self) -> None:
+        self._has_ended = False
+        self._over = np.zeros(self.num_envs, bool)
+        self._steps = np.zeros(self.num_envs, np.int64)
+
+    def _values(self, role: str, seen: Mapping[str, Any], kind: type) -> Any:
+        """What a function of the user returns, as an array with a value for each copy."""
+        return self._of_all(role, self._functions[role](seen), kind)
+
+    def _of_all(self, role: str, given: Any, kind: type | None = None) -> Any:
+        """A value for each copy, of one for all or an array with one for each."""
+        try:
+            found = np.array(given, kind)
+        except (TypeError, ValueError):
+            raise UsageError(f"{role} returned {given!r}, which are no numbers") from None
+        if found.ndim == 0:
+            return np.full(self.num_envs, found)
+        if len(found) != self.num_envs or (kind is not None and found.ndim > 1):
+            raise UsageError(
+                f"{role} returned an array of the shape {found.shape}: give a value for each of the"
+                f" {self.num_envs} copies"
+            )
+        return found
 
     def _information(self, seen: Mapping[str, Any]) -> dict[str, Any]:
-        sim_time, own = self.session.sim_time, self._info(seen)
-        if not isinstance(own, Mapping):
-            raise UsageError(f"info returned {own!r}, which is no mapping")
-        return {**({} if sim_time is None else {"sim_time": sim_time}), **own}
+        found: dict[str, Any] = {}
+        for name, value in super()._information(seen).items():
+            found[name] = self._of_all(f"info: '{name}'", value)
+            found[f"_{name}"] = np.ones(self.num_envs, bool)
+        return found
+
+
+def _with_copies(
+    project: str | os.PathLike[str] | Project, count: int | None
+) -> tuple[Project, list[str]]:
+    """The project with so many copies, and the names of its nodes with copies."""
+    if count is not None and (isinstance(count, bool) or not isinstance(count, int) or count < 1):
+        raise UsageError(f"num_envs={count!r}: give a whole number from 1 on")
+    loaded = project if isinstance(project, Project) else Project.from_file(project)
+    found = {
+        node.name: node.copies
+        for node in loaded.check_with({}, is_held=True).nodes
+        if node.copies is not None
+    }
+    if not found:
+        raise UsageError(
+            f'{loaded.name}: make_vec needs a node with "copies", whose hooks serve all at once;'
+            " gymnasium.vector.SyncVectorEnv puts environments of neuros.gym.make side by side"
+        )
+    if count is None and len({*found.values()}) > 1:
+        shown = ", ".join(f"{name} {copies}" for name, copies in found.items())
+        raise UsageError(f"{loaded.name}: its nodes have different copies ({shown}): give num_envs")
+    if count is not None:
+        loaded = loaded.with_settings({f"nodes.{name}.copies": count for name in found})
+    return loaded, [*found]
 
 
 def _numbers(
@@ -349,11 +642,21 @@ def _numbers(
     controls: Mapping[str, tuple[Any, Any]] = _NOTHING,
     *,
     is_output: bool = False,
+    copies: int | None = None,
 ) -> _Numbers:
     """The numbers of a name; ``ranges`` are by name, ``controls`` by input."""
     port = _port(project, _split(written)[0], is_output=is_output)
+    if copies is not None:
+        if port.array is None or port.array.shape[0] != copies or len(port.array.shape) < 2:
+            raise UsageError(
+                f"'{written}': a port of {copies} copies has arrays of all, with a leading axis,"
+                f' not {port.type}: give its node the key "copies"'
+            )
+        port = replace(port, type=str(port.array.of_one_copy))
     inputs = [] if is_output else _inputs_behind(project, _split(written)[0])
     driven = controls.get(inputs[0]) if inputs else None
+    if copies is not None:
+        return _BatchNumbers(port, written, inputs, ranges, copies)
     return (_ArrayNumbers if port.array else _Numbers)(port, written, inputs, ranges, driven)
 
 
@@ -491,6 +794,26 @@ class _ArrayNumbers(_Numbers):
         return made
 
 
+class _BatchNumbers(_ArrayNumbers):
+    """The numbers of a port of arrays whose first axis is that of copies.
+
+    Attributes:
+        space: of one copy.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        written: str,
+        inputs: Sequence[str],
+        ranges: Mapping[str, tuple[Any, Any]],
+        copies: int,
+    ) -> None:
+        super().__init__(port, written, inputs, ranges, None)
+        self._shape = (copies, *self._shape)
+        self._array = self._array.of_copies(copies)
+
+
 _CONVERT: Mapping[Sort, Callable[[Any], list[Any]]] = {
     Sort.BOOL: lambda numbers: numbers.astype(bool).tolist(),
     Sort.INTEGER: lambda numbers: [round(number) for number in numbers.tolist()],
@@ -505,15 +828,16 @@ def _check_steps(number: Any) -> None:
         raise UsageError(f"max_episode_steps={number!r}: give a whole number from 1 on")
 
 
-def _check_names(arguments: Iterable[str]) -> None:
-    """Refuse arguments that :func:`make` does not have. Raises ``UsageError``."""
-    own = {*inspect.signature(ProjectEnv).parameters} - {"project", "options"}
+def _check_names(arguments: Iterable[str], of: type = ProjectEnv) -> None:
+    """Refuse arguments that an environment does not have. Raises ``UsageError``."""
+    own = {*inspect.signature(of).parameters} - {"project", "options"}
     # An environment takes the inputs of its actions over.
     known = own | {*inspect.signature(Project.session).parameters} - {"self", "take_over"}
     for name in arguments:
         if name not in known:
             hint = did_you_mean(name, known) or f"it has {', '.join(sorted(own))}"
-            raise UsageError(f"neuros.gym.make has no argument '{name}' ({hint})")
+            make = "make" if of is ProjectEnv else "make_vec"
+            raise UsageError(f"neuros.gym.{make} has no argument '{name}' ({hint})")
 
 
 def _by_names(role: str, function: Callable[..., Any]) -> Callable[[Mapping[str, Any]], Any]:

@@ -29,5 +29,6 @@ except Exception:
 
 
 from neuros.simulators.mujoco.simulator import MuJoCo
+from neuros.simulators.mujoco.worlds import MuJoCoWorlds
 
-__all__ = ["MuJoCo"]
+__all__ = ["MuJoCo", "MuJoCoWorlds"]

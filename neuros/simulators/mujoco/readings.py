@@ -150,7 +150,7 @@ class Reading(Sensor):
         return mujoco.mj_id2name(model, int(sort), int(element)) or ""
 
 
-_STATE = (
+STATE = (
     *("time", "qpos", "qvel", "act", "ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos"),
     *("mocap_quat", "userdata"),
 )
@@ -162,7 +162,7 @@ _COMPUTED = (
     *("site_xpos", "site_xmat", "cam_xpos", "cam_xmat", "subtree_com", "cinert", "cvel"),
     *("ten_length", "ten_velocity", "cacc", "cfrc_int", "cfrc_ext"),
 )
-_AFTER_CONSTRAINT = {"cacc", "cfrc_int", "cfrc_ext"}
+AFTER_CONSTRAINT = {"cacc", "cfrc_int", "cfrc_ext"}
 _SLICE = re.compile(r"(\w+)(?:\[(-?\d{1,9})?:(-?\d{1,9})?\])?", re.ASCII)
 
 
@@ -178,18 +178,16 @@ class Data(Sensor):
     sorts = ("array of mjData",)
 
     def find(self, name: str, problems: Problems) -> tuple[str, int] | None:
-        match = _SLICE.fullmatch(name)
-        if match is not None and match[1] in (*_STATE, *_COMPUTED):
-            return match[1], 0
-        hint = did_you_mean(match[1] if match else name, (*_STATE, *_COMPUTED))
-        text = f"'{name}' is neither an array of mjData nor a part of one, as 'qpos[2:]'{hint}"
-        problems.add(f"{self.declared.pointer}/element", text)
-        return None
+        field = field_of(name)
+        if field is None:
+            problems.add(f"{self.declared.pointer}/element", no_field(name))
+            return None
+        return field, 0
 
     def bind(self, problems: Problems) -> None:
         names = [name for name, _ in self.elements]
-        self.needs_forward = not {*names} <= {*_STATE}
-        self._is_after_constraint = not {*names}.isdisjoint(_AFTER_CONSTRAINT)
+        self.needs_forward = not {*names} <= {*STATE}
+        self._is_after_constraint = not {*names}.isdisjoint(AFTER_CONSTRAINT)
         self._time = np.zeros(1)
         self._data: Any = None
         count = sum(part.size for part in self._parts_of(mujoco.MjData(self.model)))
@@ -199,21 +197,47 @@ class Data(Sensor):
         if data is not self._data:
             self._data, self._parts = data, self._parts_of(data)
         self._time[0] = data.time
-        # mj_forward leaves these out unless a sensor of the model needs them.
-        if self._is_after_constraint and not getattr(data, "flg_rnepost", False):
-            mujoco.mj_rnePostConstraint(self.model, data)
+        if self._is_after_constraint:
+            compute_forces(self.model, data)
         _fill_rows(packet, self._parts)
 
     def _parts_of(self, data: Any) -> list[Any]:
         """Views of the arrays."""
-        parts = []
-        for name in self.declared.elements:
-            match = _SLICE.fullmatch(name)
-            assert match is not None
-            whole = self._time if match[1] == "time" else getattr(data, match[1])
-            first, end = (int(each) if each else None for each in match.groups()[1:])
-            parts.append(whole[first:end].reshape(-1))
-        return parts
+        return [part_of(data, name, self._time) for name in self.declared.elements]
+
+
+def field_of(name: str) -> str | None:
+    """The array of mjData that a name like ``qpos[2:]`` is about; ``None`` if it is about none."""
+    match = _SLICE.fullmatch(name)
+    return match[1] if match is not None and match[1] in (*STATE, *_COMPUTED) else None
+
+
+def part_of(data: Any, name: str, time: Any) -> Any:
+    """A view of an array of mjData, or of a part of it, as one row.
+
+    Args:
+        data: the ``mujoco.MjData``.
+        name: one that :func:`field_of` knows.
+        time: an array of one number, which stands for the time: that is no array in mjData.
+    """
+    match = _SLICE.fullmatch(name)
+    assert match is not None
+    whole = time if match[1] == "time" else getattr(data, match[1])
+    first, end = (int(each) if each else None for each in match.groups()[1:])
+    return whole[first:end].reshape(-1)
+
+
+def compute_forces(model: Any, data: Any) -> None:
+    """Compute :data:`AFTER_CONSTRAINT`, as mj_forward does if a sensor of the model needs it."""
+    if not getattr(data, "flg_rnepost", False):
+        mujoco.mj_rnePostConstraint(model, data)
+
+
+def no_field(name: str) -> str:
+    """The problem with a name that :func:`field_of` does not know."""
+    match = _SLICE.fullmatch(name)
+    hint = did_you_mean(match[1] if match else name, (*STATE, *_COMPUTED))
+    return f"'{name}' is neither an array of mjData nor a part of one, as 'qpos[2:]'{hint}"
 
 
 def _fill_rows(packet: Packet, parts: list[Any]) -> None:

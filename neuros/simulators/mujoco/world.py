@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, MutableSet, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,7 @@ class Declared:
                 if not fine:
                     self._spec.visual.quality.offsamples = 0
             add_drives(self._spec, _joints_of(self._spec), self._commands, problems)
-            self.model = _compiled(self._spec.compile, self.where)
+            self.model = compiled(self._spec.compile, self.where)
         except ModelError as error:
             problems.add_text(str(error))
             problems.raise_any()
@@ -121,7 +121,7 @@ class World(Declared):
     def __init__(self, node: NodeContext, model: Any, *, fine: bool) -> None:
         self._node = node
         problems = Problems(node.description.file)
-        super().__init__(node.description, lambda: _load_spec(node, model), problems, fine=fine)
+        super().__init__(node.description, lambda: load_spec(node, model), problems, fine=fine)
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
         if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
@@ -131,7 +131,7 @@ class World(Declared):
         self._fields = ModelFields(self.where)
         self._fields.apply(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
-        self._forward()
+        forward(self.model, self.data)
 
     @property
     def time_s(self) -> float:
@@ -164,7 +164,7 @@ class World(Declared):
         """The packets of these sensors for the present state."""
         sensors = {output: self._bound.sensors[output] for output in outputs}
         if any(sensor.needs_forward for sensor in sensors.values()):
-            self._forward()
+            forward(self.model, self.data)
         time_ns = self.time.nanoseconds(self.steps)
         packets = {}
         for output, sensor in sensors.items():
@@ -175,20 +175,11 @@ class World(Declared):
                 sensor.fill_array(packet, self.data)
         return packets
 
-    def _forward(self) -> None:
-        """Compute from the present state what sensors measure, without a change of the next step.
-
-        ``mj_forward`` restarts the solver, which would change that.
-        """
-        solution = self.data.qacc_warmstart.copy()
-        mujoco.mj_forward(self.model, self.data)
-        self.data.qacc_warmstart[:] = solution
-
     def reset(self) -> None:
         """Back to time zero and the model's initial state; spawned entities stay."""
         self._fields.apply(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
-        self._forward()
+        forward(self.model, self.data)
         self.steps = 0
 
     def spawn(self, path: str, position: Sequence[float], name: str) -> None:
@@ -197,11 +188,11 @@ class World(Declared):
             raise ModelError(f"entity '{name}': a position is x, y, z in metres, not {position!r}")
         if not name or _is_taken(name, names_of(self.model, "body")):
             raise ModelError(f"an entity needs a name of its own: '{name}' is taken")
-        child, where = _load_spec(self._node, path)
+        child, where = load_spec(self._node, path)
         # First on a copy: a spec cannot go back once something that does not fit is attached.
         trial, problems = self._spec.copy(), Problems(self._node.description.file)
         self._attach(trial, child.copy(), position, name, problems)
-        self._bind(_compiled(trial.compile, where), problems)
+        self._bind(compiled(trial.compile, where), problems)
         problems.raise_any()
         self._attach(self._spec, child, position, name, problems)
         # The new elements come last in the world.
@@ -223,7 +214,7 @@ class World(Declared):
             each.name = f"#{number}"
         trial.delete(frame)
         problems = Problems(self._node.description.file)
-        model = _compiled(trial.compile, self.where)
+        model = compiled(trial.compile, self.where)
         bound = self._bind(model, problems)
         problems.raise_any()
         if not (bound.is_complete or may_unbind):
@@ -272,20 +263,41 @@ class World(Declared):
 
     def _report_warnings(self, count: int) -> None:
         """Log new warnings of MuJoCo; raise ``ModelError`` where the state has diverged."""
-        for warning, number in enumerate(self.data.warning.number.tolist()):
-            if not number:
-                continue
-            info = int(self.data.warning[warning].lastinfo)
-            text = mujoco.mju_warningText(warning, info)
-            if warning in [fatal.value for fatal in _FATAL]:
-                since = self.time.seconds(self.steps - count)
-                raise ModelError(
-                    f"{self.where}: unstable between {since:g} s and {self.time_s:g} s of "
-                    f"simulated time: {text} A smaller timestep, softer contacts or gains may help."
-                )
-            if warning not in self._seen_warnings:
-                self._seen_warnings.add(warning)
-                self._node.get_logger().warning(f"{self.where}: MuJoCo: {text}")
+        since = self.time.seconds(self.steps - count)
+        when = f"between {since:g} s and {self.time_s:g} s of simulated time"
+        report_warnings(self._node, self.data, self.where, when, self._seen_warnings)
+
+
+def forward(model: Any, data: Any) -> None:
+    """Compute from the present state what sensors measure, without a change of the next step.
+
+    ``mj_forward`` restarts the solver, which would change that.
+    """
+    solution = data.qacc_warmstart.copy()
+    mujoco.mj_forward(model, data)
+    data.qacc_warmstart[:] = solution
+
+
+def report_warnings(
+    node: NodeContext, data: Any, where: str, when: str, seen: MutableSet[int]
+) -> None:
+    """Log the warnings of MuJoCo that are not among those seen.
+
+    Raises:
+        ModelError: if the state has diverged.
+    """
+    for warning, number in enumerate(data.warning.number.tolist()):
+        if not number:
+            continue
+        text = mujoco.mju_warningText(warning, int(data.warning[warning].lastinfo))
+        if warning in [fatal.value for fatal in _FATAL]:
+            raise ModelError(
+                f"{where}: unstable {when}: {text} A smaller timestep, softer contacts or gains"
+                " may help."
+            )
+        if warning not in seen:
+            seen.add(warning)
+            node.get_logger().warning(f"{where}: MuJoCo: {text}")
 
 
 class ModelFields:
@@ -375,7 +387,7 @@ def _is_taken(entity: str, bodies: Iterable[str]) -> bool:
     return any(body.startswith(f"{entity}/") for body in bodies)
 
 
-def _load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
+def load_spec(node: NodeContext, model: Any) -> tuple[Any, str]:
     """A new ``MjSpec``, and its name in messages.
 
     ``model`` is the path of an MJCF, URDF or SDF file, also in a folder of Gazebo's variables,
@@ -424,15 +436,15 @@ def problems_of(description: Node, model: Path | str) -> list[tuple[str, str]]:
 
 def _from_text(description: Node, model: str) -> tuple[Any, str]:
     where = f"XML text in {description.plugin}"
-    return _compiled(lambda: mujoco.MjSpec.from_string(model), where), where
+    return compiled(lambda: mujoco.MjSpec.from_string(model), where), where
 
 
 def _from_file(description: Node, path: Path, warn: Callable[[str], object]) -> Any:
     kind = path.suffix.lower()
     if kind == ".xml":
-        return _compiled(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
+        return compiled(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
     if kind == ".mjcf":  # MuJoCo's from_file knows .xml only
-        spec = _compiled(lambda: mujoco.MjSpec.from_string(path.read_text("utf-8")), str(path))
+        spec = compiled(lambda: mujoco.MjSpec.from_string(path.read_text("utf-8")), str(path))
         spec.modelfiledir = str(path.parent)
         return spec
     try:
@@ -453,7 +465,7 @@ def _joints_of(spec: Any) -> set[str]:
     return {joint.name for joint in spec.joints}
 
 
-def _compiled(parse: Callable[[], Any], where: str) -> Any:
+def compiled(parse: Callable[[], Any], where: str) -> Any:
     """The result of ``parse``; an error of MuJoCo becomes a ``ModelError`` about ``where``."""
     try:
         return parse()
