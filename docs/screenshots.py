@@ -123,8 +123,7 @@ def world_of(page: Any, project: Path, file: Path, sim_s: float, *arguments: str
 
 def shoot_correction(page: Any, weights: Path) -> None:
     """WhiskEye, corrected by what its eyes see, under a bias of the gyroscope."""
-    values = {"pcn.environment.WEIGHTS": weights, "snn.environment.GYRO_BIAS": 0.1}
-    arguments = [f"--set=nodes.{key}={value}" for key, value in values.items()]
+    arguments = [f"--restore=pcn.weights={weights}", "--set=nodes.snn.environment.GYRO_BIAS=0.1"]
     project = WHISKEYE.with_name("prediction.json")
     with page_of(project, "dashboard", "--dashboard", *arguments, *LONG) as url:
         page.goto(url)

@@ -505,8 +505,13 @@ Notice: TypeAlias = tuple[str, str]  # a line for the user: severity (INFO, WARN
 
 
 class Deployment(ABC):
-    """A back end ready for some nodes; the defaults are for nodes with this machine's paths."""
+    """A back end ready for some nodes; the defaults are for nodes with this machine's paths.
 
+    Attributes:
+        transport: the name of the transport of the nodes, if not that of the back end.
+    """
+
+    transport = ""
     notices: Sequence[Notice] = ()
     places: Mapping[str, str] = {}
     """The machine of each node that runs on another one."""

@@ -85,6 +85,7 @@ GENERATORS |= {"rosidl_adapter", "rosidl_cli"}
 THIRD_PARTY: dict[str, set[str]] = {
     "project.validate": {"jsonschema", "referencing"},
     "control": {"msgspec"},
+    "node.keeping": {"numpy"},
     "time": {"builtin_interfaces"},
     "transport": {
         "numpy",

@@ -28,15 +28,15 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 49_900)
+    hold("lines of neuros/", lines(NEUROS), 50_520)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 63_723)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 64_358)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 82_651)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 83_955)
 
 
 def test_private_functions_that_are_used_once() -> None:

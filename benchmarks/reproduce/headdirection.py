@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,14 +62,9 @@ _SLOWEST = 40
 
 
 def run(name: str, folder: Path, duration_s: float, backend: str) -> None:
-    """Train, or predict; the number of the run is the seed of both.
-
-    The project is copied beside the runs: in containers its nodes see that folder only, where the
-    weights have to be.
-    """
+    """Train, or predict; the number of the run is the seed of both."""
     seed = _number(folder)
-    project = folder.parents[1] / "whiskeye"
-    shutil.copytree(WHISKEYE, project, dirs_exist_ok=True)
+    options: Sequence[str] = ()
     if name == TRAINING:
         file, settings = (
             "training.json",
@@ -82,11 +76,10 @@ def run(name: str, folder: Path, duration_s: float, backend: str) -> None:
         )
     else:
         rate_rad_s, bias_rad_s = WAYS[name]
-        shutil.copyfile(_weights(folder.parents[1], seed), project / WEIGHTS)
+        options = "--restore", f"pcn.weights={_weights(folder.parents[1], seed)}"
         file, settings = (
             "prediction.json",
             {
-                "pcn.environment.WEIGHTS": WEIGHTS,
                 "snn.environment.SEED": seed,
                 "snn.environment.GYRO_BIAS": bias_rad_s,
                 "robot.environment.SEED": seed,
@@ -98,9 +91,10 @@ def run(name: str, folder: Path, duration_s: float, backend: str) -> None:
         file = "learning.json"
         settings["robot.environment.CHANGE_S"] = 2 * duration_s  # never: the bias alone is learnt
     launch(
-        project / file,
+        WHISKEYE / file,
         folder,
         backend,
+        options=options,
         settings={f"nodes.{key}": value for key, value in settings.items()},
         timeout_s=RUN_S + _SLOWEST * duration_s,
     )

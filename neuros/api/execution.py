@@ -38,6 +38,7 @@ from neuros.backends.console import (
 from neuros.backends.control_sockets import UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
+from neuros.backends.process_launchers import WITHOUT_ROS
 from neuros.backends.reaper import Reaper
 from neuros.backends.sessions import RunOnThisMachine, reaper_environment, this_process
 from neuros.backends.sidecars import Recorded
@@ -156,7 +157,8 @@ class Execution:
         try:
             self._console.log("INFO", f"{self._domain.reason}; run folder {self.folder}")
             commands = f"neuros topic list {self._run_id[:8]}"
-            if not self._plan.request.isolate:
+            is_hidden = self._plan.deployment.transport == WITHOUT_ROS
+            if not (self._plan.request.isolate or is_hidden):
                 commands += f", or ROS_DOMAIN_ID={self._domain.id} ros2 topic list"
             self._console.log("INFO", f"to look into it: {commands}")
             for severity, notice in self._plan.notices:

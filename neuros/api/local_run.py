@@ -142,12 +142,13 @@ class LocalRun:
             if self._is_behind or not rounds:
                 self._come_to_rest()
             for _ in range(rounds):
-                if end_sim_s is not None and (self._sim_time() or 0.0) >= end_sim_s:
+                if (
+                    end_sim_s is not None
+                    and max(self._sim_times().values(), default=0.0) >= end_sim_s
+                ):
                     break
-                is_driven = any(
-                    node.engine is not None and node.engine.is_driving for node in nodes
-                )
                 self._is_behind = True
+                is_driven = self._is_driven
                 for node in nodes:
                     node.step(1, is_driven=is_driven)
                 self._come_to_rest()
@@ -189,7 +190,9 @@ class LocalRun:
             return None
         return [node.reports.look({}, 0) for node in self._nodes.values()]
 
-    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def reset(
+        self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
+    ) -> bool:
         """Bring all nodes back to their start, if they can be; see :meth:`HeldRun.reset`."""
         nodes = self._nodes.values()
         if self._run is not None or any(node.why_not_reset for node in nodes):
@@ -201,7 +204,7 @@ class LocalRun:
             self._loop.run_until_idle()
             for node in nodes:
                 try:
-                    node.reset(variables.get(node.name, {}))
+                    node.reset(variables.get(node.name, {}), keep.get(node.name, ()))
                 except NeurosError as error:
                     self._fail(node.name, error)
                     break
@@ -305,9 +308,16 @@ class LocalRun:
         for deliver in sent:
             deliver()
 
-    def _sim_time(self) -> float | None:
-        times = (node.sim_time for node in self._nodes.values())
-        return max((time_s for time_s in times if time_s is not None), default=None)
+    @property
+    def _is_driven(self) -> bool:
+        for node in self._nodes.values():
+            if node.engine is not None and node.engine.is_driving:
+                return True
+        return False
+
+    def _sim_times(self) -> dict[str, float]:
+        nodes = self._nodes.values()
+        return {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None}
 
     def _rest(self, known: Mapping[str, int]) -> AtRest | None:
         if self._failed_or_over():
@@ -324,8 +334,7 @@ class LocalRun:
             history = self._nodes[node_name].histories.by_output.get(output)
             if history is not None and history.count > number:
                 packets[name] = history.count, history.since(number)
-        times = {n.name: time_s for n in self._nodes.values() if (time_s := n.sim_time) is not None}
-        return AtRest(0, times, packets)
+        return AtRest(0, self._sim_times(), packets)
 
     def _inside(self, end_s: float | None = None) -> _Thread:
         """The thread of the program for nodes, until a time (monotonic, seconds)."""
@@ -364,6 +373,7 @@ class LocalRun:
             because = f": {message.reason}" if message.reason else ""
             reason = f"{message.node} ended the project{because}"
             self._end = reason, message.drain_s, message.node
+            self._loop.end_run()
 
     def _fail(self, name: str, error: NeurosError) -> None:
         if name in self._nodes:
@@ -373,6 +383,7 @@ class LocalRun:
         self.error = self.error or error
         first_line = (str(error).strip() or "no reason was given").splitlines()[0]
         self._outcome.fail(f"node '{name}' failed: {first_line}")
+        self._loop.end_run()
         for node in self._nodes.values():
             node.stop()
 
@@ -401,10 +412,15 @@ class LocalRun:
             return
         outcome = self._outcome
         outcome.begin_to_end(time.monotonic())
+        interruption: KeyboardInterrupt | None = None
         try:
             if self._end is not None and not outcome.failures and self._is_active:
                 outcome.reason, drain_s, stopped = self._end
-                self._drain(drain_s, stopped)
+                try:
+                    self._drain(drain_s, stopped)
+                except KeyboardInterrupt as error:
+                    interruption = error
+                    outcome.fail("ended by Ctrl+C", EXIT_CODES[signal.SIGINT])
             with self._inside():
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
@@ -419,6 +435,8 @@ class LocalRun:
                 LocalRun._nest_user = None
             self._record()
             self._run = Run(self.folder)
+        if interruption is not None:
+            raise interruption
 
     def _drain(self, drain_s: float, stopped: str) -> None:
         last_round = self._declarations.last_round(stopped)
@@ -554,7 +572,7 @@ class _Thread:
     def _on_interrupt(self, number: int, frame: FrameType | None) -> None:
         if not self._is_inside or self._loop.interruption is not None:
             signal.default_int_handler(number, frame)
-        self._loop.interruption = KeyboardInterrupt()
+        self._loop.interrupt(KeyboardInterrupt())
 
 
 def _uses_nest(node: Node) -> bool:
@@ -602,7 +620,7 @@ class _Watchdog:
     def _watch(self) -> None:
         if self._is_over.wait(max(0.0, self._end_s - time.monotonic())):
             return
-        self._loop.interruption = TimeoutError("the run has not come to rest in time")
+        self._loop.interrupt(TimeoutError("the run has not come to rest in time"))
         if self._is_over.wait(_GRACE_S):
             return
         with self._lock:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 
+from neuros.api.kept import Sources, find_sources, given_sources
 from neuros.api.request import Duration, Request
 from neuros.backends.node_command import place, usable_cores, without_mark
 from neuros.backends.pythons import Pythons, require_one_python
@@ -120,6 +121,7 @@ class Plan:
 
     Attributes:
         is_held: whether a session steps the run.
+        restored: what nodes get back that their plugins have kept.
     """
 
     project: Project
@@ -130,6 +132,7 @@ class Plan:
     network: Network = THIS_MACHINE
     messages: Messages | None = None
     is_held: bool = False
+    restored: Sources = field(default_factory=dict)
 
     @property
     def elsewhere(self) -> tuple[str, ...]:
@@ -189,15 +192,21 @@ class Plan:
         paths = self.messages.paths if self.messages else ()
         lists = _LISTS * max(1, len(self.project.connections))
         list_bytes = self.request.packet_log_bytes // lists
+        restored = {
+            node: {name: str(file) for name, file in values.items()}
+            for node, values in self.restored.items()
+        }
         return [
-            replace(f, messages=paths, list_bytes=list_bytes)
+            replace(
+                f, messages=paths, list_bytes=list_bytes, restored=restored.get(f.node.name, {})
+            )
             for f in files
             if f.node.name in self.names
         ]
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
         """The launcher of the back end; it reports its processes to ``reaper``."""
-        options = ["--transport", self.back_end.transport]
+        options = ["--transport", self.deployment.transport or self.back_end.transport]
         if self.back_end.is_one_process:
             options.append("--one-process")
         if self.request.end.sim_s is not None:
@@ -245,6 +254,7 @@ def make_plan(
         if name not in known:
             raise UsageError(f"-n {name}: no such node; the project has {', '.join(known)}")
     names = tuple(name for name in known if not request.nodes or name in request.nodes)
+    restored = find_sources(given_sources(request.restore), names)
     nodes = [project.node(name) for name in names]
     if request.deployment is None:
         chosen = choose(request.backend or AUTO, project, nodes, request.backend_options or {})
@@ -257,7 +267,7 @@ def make_plan(
         _check_reach(project, names, back_end)
     has_pythons = not (back_end.is_one_process or back_end.has_own_pythons)
     pythons = Pythons.choose(nodes if has_pythons else [], project.folder, os.environ)
-    plan = Plan(project, names, chosen, request, pythons, network, messages)
+    plan = Plan(project, names, chosen, request, pythons, network, messages, restored=restored)
     if back_end.is_one_process and network.is_wide and plan.is_partial:
         raise UsageError(
             f"--network with -n: the nodes of the {back_end.name} back end cannot reach nodes"

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.api.kept import given_sources
 from neuros.api.live import LiveRun
 from neuros.api.loading import (
     foreseen_failures,
@@ -310,7 +311,9 @@ class Project:
             )
         count = itertools.count(1)
 
-        def prepare(seed: int | None, settings: Mapping[str, Any]) -> Callable[[], Held]:
+        def prepare(
+            seed: int | None, settings: Mapping[str, Any]
+        ) -> Callable[[Mapping[str, Any]], Held]:
             wanted = options.set
             if isinstance(wanted, Mapping):
                 wanted = with_model_fields(self._loaded.project, wanted)
@@ -319,11 +322,12 @@ class Project:
             project, messages = self._load_for_run(chosen, is_held=True)
             held, inputs = with_session_inputs(project, options.take_over)
 
-            def start() -> Held:
+            def start(restore: Mapping[str, Any]) -> Held:
                 number, output = next(count), None
                 if options.output is not None:  # out, out-2, out-3
                     output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
-                own = replace(chosen, output=output)
+                restored = {**given_sources(options.restore), **restore}
+                own = replace(chosen, output=output, restore=restored)
                 run: HeldRun
                 if options.backend == LOCAL:
                     plan = make_plan(held, messages, replace(own, backend=IN_PROCESS))

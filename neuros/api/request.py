@@ -152,6 +152,15 @@ class Request(ProjectOptions):
         is_recorded=False,
         help="write the run into this folder, which must be new or empty",
     )
+    restore: Mapping[str, Any] | Sequence[str] = option(
+        "--restore",
+        is_repeatable=True,
+        metavar="NODE.NAME=RUN",
+        is_recorded=False,
+        page="plugins.md#what-is-kept",
+        help="give back to a node what its plugin has kept by this name in an earlier run (see"
+        " node.keep); RUN is the folder of that run, or a file",
+    )
     finalise_s: float | None = option(
         "--finalise-s",
         parse=positive_seconds,

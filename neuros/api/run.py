@@ -9,6 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.api.kept import kept_value
 from neuros.api.run_record import PastRun, open_run, run_table
 from neuros.errors import RunError
 from neuros.project.scanner import read_bytes
@@ -109,6 +110,14 @@ class Run(PastRun):
         from neuros.bag import open_bag
 
         return open_bag(self.folder)
+
+    def kept(self, value: str) -> Any:
+        """What a node has kept with ``node.keep``, by its name: ``run.kept("brain.weights")``.
+
+        Raises:
+            UsageError: if the run has kept nothing of that name.
+        """
+        return kept_value(self.folder, value)
 
     def log(self, node: str) -> str:
         """The log and output of a node.

@@ -8,6 +8,7 @@
         launcher.log               stacks that are too long for the console
         <node>/node.json           project, connections and settings of the node
         <node>/node.log            its output and log
+        <node>/kept/               what its plugin keeps, restored/: what was restored to it
         <node>/plugin/             the plugin file, if a program gave functions
         <node>/...                 files that its plugin wrote to node.run_dir
 """
@@ -28,6 +29,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.api.kept import copy_sources
 from neuros.api.plan import Plan
 from neuros.api.plugin_text import PluginText
 from neuros.api.run_record import EXIT_ENVIRONMENT
@@ -140,6 +142,7 @@ def write_node_files(
             seen = plan.deployment.as_seen(file)
             path.touch(0o600)  # it holds the environment, which others must not read
             path.write_text(node_file_text(seen), "utf-8")
+        copy_sources(plan.restored, run_folder)
     return plan, files
 
 

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neuros.api.kept import record_of_values
 from neuros.engine.metrics import in_flight_and_lost, time_budget_of
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Budgets, Connection, NodeFile, Project
@@ -55,9 +56,10 @@ def run_record(
             name: {
                 **_node(name, ended),
                 "results": _results(run_folder / name),
+                **record_of_values(run_folder, file),
                 **({"stack": ended.stacks[name]} if name in ended.stacks else {}),
             }
-            for name in (file.node.name for file in files)
+            for name, file in ((file.node.name, file) for file in files)
         },
         "expanded_project": project_to_json(project),
     }
@@ -99,6 +101,13 @@ def run_table(record: Mapping[str, Any]) -> str:
         f" {c['compressed_bytes'] / 1e6:.3g} MB"
         for c in record["connections"]
         if "bytes" in c
+    ]
+    parts += [
+        f"{node}.{name} was {how}: {value['bytes']} bytes, SHA-256 {value['sha256'][:12]}"
+        for node, figures in record["nodes"].items()
+        for how in ("restored", "kept")
+        for name, value in figures.get(how, {}).items()
+        if value["sha256"]
     ]
     times = f"wall time {record['wall_s']:.2f} s"
     if record.get("paused_s"):  # missing in records of earlier versions

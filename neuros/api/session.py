@@ -39,12 +39,15 @@ from neuros.errors import NeurosError, RunError, UsageError
 from neuros.node.instruments import MOST_PACKETS
 from neuros.project.graph import graph_svg
 from neuros.project.model import Node, Port
+from neuros.project.suggest import did_you_mean, listed
 from neuros.transport.messages import checked
 
 _READ_S = 1.0
 _MOST_ROUNDS_AT_REST = 1000
 _FINE = 1e-9
 _MOST_VARIATION = 2.0
+Prepare = Callable[[int | None, Mapping[str, Any]], Callable[[Mapping[str, Any]], Held]]
+"""Checks a run with a seed and settings; what it returns starts that, with values to restore."""
 
 
 class Session:
@@ -65,17 +68,13 @@ class Session:
         runs: those that a reset has ended; each has a folder of its own.
     """
 
-    def __init__(
-        self,
-        prepare: Callable[[int | None, Mapping[str, Any]], Callable[[], Held]],
-        seed: int | None,
-    ) -> None:
+    def __init__(self, prepare: Prepare, seed: int | None) -> None:
         self._prepare = prepare
         self._seed = seed
         self._lock = threading.RLock()
         self._outputs: dict[str, _Received] = {}
         self.runs: list[Run] = []
-        self._hold(prepare(seed, {})())
+        self._hold(prepare(seed, {})({}))
 
     def _hold(self, held: Held) -> None:
         """Take a run that has just been started."""
@@ -174,7 +173,13 @@ class Session:
             duration_s = check_seconds(duration_s=duration_s)
             return self._take(self._held.run_for(duration_s, self._known))
 
-    def reset(self, seed: int | None = None, *, set: Mapping[str, Any] | None = None) -> None:
+    def reset(
+        self,
+        seed: int | None = None,
+        *,
+        set: Mapping[str, Any] | None = None,
+        keep: bool | str | Sequence[str] = False,
+    ) -> None:
         """Bring every node back to where it was when the session began, with a seed and settings.
 
         The same seed and settings give the same packets from then on. Where all nodes are in one
@@ -189,21 +194,53 @@ class Session:
                 ``nodes.robot.environment.RATE``, or any other path of ``--set``; and fields of a
                 MuJoCo model: ``robot.model.geom_friction`` (of ``mujoco.MjModel``; a number for
                 all its values, or all of them in its shape).
+            keep: what survives of that which plugins keep (``node.keep``), as in
+                ``"brain.weights"``, or several in a list; ``True``: all of it. Other values are
+                those of the beginning, ``restore`` of the session included.
 
         Raises:
-            UsageError: if there is a seed, and no node takes one; for a path that leads nowhere.
+            UsageError: if there is a seed, and no node takes one; for a path that leads nowhere;
+                for a name by which nothing is kept.
             ProjectError, EnvironmentFault, RunError: as for the start of a session.
         """
         with self._lock:
             seed = self._seed if seed is None else seed
             settings = with_model_fields(self._project, set or {})
-            if not self._reset_in_place(seed, settings):
+            kept = self._kept(keep)
+            if not self._reset_in_place(seed, settings, kept):
                 start = self._prepare(seed, settings)  # what is wrong ends no run
-                self.runs.append(self.close("the session was reset"))
-                self._hold(start())
+                run = self.close("the session was reset")
+                self.runs.append(run)
+                self._hold(start({f"{node}.{name}": run for node in kept for name in kept[node]}))
             self._seed = seed
 
-    def _reset_in_place(self, seed: int | None, settings: Mapping[str, Any]) -> bool:
+    def _kept(self, asked: bool | str | Sequence[str]) -> dict[str, list[str]]:
+        """The names of the values that a reset keeps, by node."""
+        if not asked:
+            return {}
+        if (statuses := self._held.look() if self._run is None else None) is not None:
+            known = [f"{each.node}.{name}" for each in statuses for name in each.keeps]
+        else:  # it has ended
+            self._end()
+            assert self._run is not None
+            nodes = self._run.nodes.items()
+            known = [
+                f"{node}.{name}" for node, figures in nodes for name in figures.get("kept", ())
+            ]
+        wanted = [asked] if isinstance(asked, str) else known if asked is True else [*asked]
+        found: dict[str, list[str]] = {}
+        for value in wanted:
+            node, _, name = value.partition(".")
+            if value not in known:
+                has = f"plugins keep {listed(known)}" if known else "no plugin has called node.keep"
+                hint = did_you_mean(value, known) or has
+                raise UsageError(f"keep: nothing in node '{node}' keeps '{name}' ({hint})")
+            found.setdefault(node, []).append(name)
+        return found
+
+    def _reset_in_place(
+        self, seed: int | None, settings: Mapping[str, Any], kept: Mapping[str, Sequence[str]]
+    ) -> bool:
         """Whether the nodes could be reset in their process."""
         variables = {} if seed is None else seed_variables(self._project, seed)
         names = [node.name for node in self._project.nodes]
@@ -216,7 +253,7 @@ class Session:
                 return False
             variables.setdefault(node, {})[variable] = value_text(path, value)
         try:
-            if self._run is not None or not self._held.reset(variables):
+            if self._run is not None or not self._held.reset(variables, kept):
                 return False
         except RunError:
             return False

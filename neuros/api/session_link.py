@@ -91,11 +91,14 @@ class HeldRun(Protocol):
     def copy(self, type_name: str, content: Any) -> Any:
         """A packet of its own for the program, from the content that came with an answer."""
 
-    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def reset(
+        self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
+    ) -> bool:
         """Bring all nodes back to their start, paused; ``False`` if they cannot be, or have ended.
 
         Args:
             variables: of their environments that change, by node.
+            keep: names of the values of their plugins that survive, by node.
         """
 
     def look(self) -> Sequence[NodeStatus] | None:
@@ -188,11 +191,13 @@ class LaunchedRun:
     def copy(self, type_name: str, content: bytes) -> Any:
         return self._packets.decode(type_name, content)
 
-    def reset(self, variables: Mapping[str, Mapping[str, str]]) -> bool:
+    def reset(
+        self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
+    ) -> bool:
         # A round that was given up may go on for ever: it ends as a free run does.
         if (self.run_for(0.0, {}) if self.is_behind else self.advance(0, {})) is None:
             return False
-        self._send(Reset(variables))
+        self._send(Reset(variables, {node: tuple(names) for node, names in keep.items()}))
         answer = self._answer(WasReset, lambda _: True, None)
         return answer is not None and not answer.why_not
 

@@ -148,6 +148,7 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> RunComparison:
             only = "A" if name in a.connections else "B"
             text = f"{name}: only run {only} has this connection"
             comparer.differences.append(_Difference(-1.0, text))
+    comparer.compare_values()
     return comparer.result()
 
 
@@ -236,6 +237,17 @@ class _Comparer:
         elif consumed is not None:
             self._consumed_differently.append(name)
             self._remarks.append(f"{consumed.text}: this connection may lose packets")
+
+    def compare_values(self) -> None:
+        """Compare the files of what plugins keep, and of what was restored to them."""
+        a, b = (run.nodes for run in self._runs)
+        for node in [name for name in a if name in b]:
+            for how in ("restored", "kept"):
+                one, other = (nodes[node].get(how, {}) for nodes in (a, b))
+                for name in dict.fromkeys([*one, *other]):
+                    hashes = [values.get(name, {}).get("sha256") for values in (one, other)]
+                    if hashes[0] != hashes[1]:
+                        self._remarks.append(f"{node}.{name}: another value was {how} in run B")
 
     def _counted(self, name: str) -> _Difference | None:
         """The difference between the counters of both runs, where no lists tell it."""

@@ -21,9 +21,13 @@ from neuros.backends.node_command import (
 )
 from neuros.backends.reaper import UNKNOWN
 from neuros.errors import EnvironmentFault
+from neuros.options import Option
 from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Reaper
 from neuros.project.model import Node, NodeFile, Project
 from neuros.stacks import ProcessThreads, threads_of
+
+WITHOUT_ROS = "local"
+"""The transport of nodes of one process that no ROS tool finds."""
 
 
 class ProcessBackEnd(BackEnd):
@@ -46,11 +50,20 @@ class InProcessBackEnd(BackEnd):
     place = "one process with all others"
     transport = "memory"
     is_one_process = True
+    options = (
+        Option(
+            ("--no-ros",),
+            "leave ROS out: no topics for ROS tools; ROS starts only if a plugin or an external"
+            " topic needs it",
+            default=True,
+            page="back_ends.md#without-ros",
+        ),
+    )
 
     def prepare(
         self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
     ) -> Deployment:
-        return InProcessDeployment(nodes)
+        return InProcessDeployment(nodes, "" if options["ros"] else WITHOUT_ROS)
 
 
 ProcessOf: TypeAlias = "Callable[[NodeProgram, NodeFile, Mapping[str, str]], NodeProcess]"
@@ -74,6 +87,10 @@ class ProcessDeployment(Deployment):
 
 class InProcessDeployment(ProcessDeployment):
     """One process of this machine for all nodes."""
+
+    def __init__(self, nodes: Sequence[Node], transport: str) -> None:
+        super().__init__(nodes)
+        self.transport = transport
 
     def launcher(self, program: NodeProgram) -> Launcher:
         return InProcessLauncher(program)

@@ -182,6 +182,7 @@ def _replay_node(options: argparse.Namespace) -> int:
     from neuros.cli.environments import require_messages
     from neuros.distribution import WORKSPACE
     from neuros.messages.workspace import message_cache
+    from neuros.node.keeping import RESTORED
     from neuros.replay.from_container import as_on_this_machine
     from neuros.replay.recorded_node import RecordedNode, recorded_node
 
@@ -195,6 +196,8 @@ def _replay_node(options: argparse.Namespace) -> int:
     if ended:
         return ended
     folder = _folder(options.output)
+    if file.restored:
+        shutil.copytree(run.folder / options.node / RESTORED, folder / options.node / RESTORED)
     file = replace(file, folders=replace(file.folders, run=folder))
     command = python_command("neuros.cli", "replayed", "--run", str(run.folder), python=python)
     command += ["--pdb"] if options.pdb else []
@@ -332,7 +335,7 @@ def _become(command: Sequence[str], file: NodeFile) -> None:
     from neuros.project.split import node_file_text
 
     own = file.folders.run / file.node.name
-    own.mkdir()
+    own.mkdir(exist_ok=True)  # what was restored to the node is there
     (own / "node.json").write_text(node_file_text(file), "utf-8")
     added = {
         **node_environment(file),

@@ -239,13 +239,17 @@ class Heard(Message):
 
 
 class NodeStatus(Message):
-    """State and samples of a node, for the observer with this number; in answer to ``look``."""
+    """State and samples of a node, for the observer with this number; in answer to ``look``.
+
+    ``keeps``: names of the values that its plugin keeps (``node.keep``).
+    """
 
     node: str
     asker: int
     sim_time: float | None = None
     counters: LiveCounters | None = None
     samples: Mapping[str, dict[str, Any]] = {}
+    keeps: tuple[str, ...] = ()
 
 
 class AtRest(Message):
@@ -360,9 +364,15 @@ class Advance(Message):
 
 
 class Reset(Message):
-    """While paused, return to the start and stay paused; ``variables``: environments, by node."""
+    """While paused, return to the start and stay paused.
+
+    Attributes:
+        variables: environments, by node.
+        keep: names of the values of its plugin that survive, by node.
+    """
 
     variables: Mapping[str, Mapping[str, str]]
+    keep: Mapping[str, tuple[str, ...]] = {}
 
 
 class Deliver(Message):

@@ -208,7 +208,9 @@ class Engine:
         self._wake()
         self._lifecycle.drain(self.all_hooks[place] for place in last_round)
         self._cause = self.rest()
-        self.resume()
+        if self._pause.is_on:
+            self._pause.end(self._wake())
+            self._pass()
 
     def pause(self) -> None:
         """Start only initialise hooks and steps until :meth:`resume`.
@@ -221,10 +223,17 @@ class Engine:
         self._cause = self.rest()
 
     def resume(self) -> None:
-        """Go on after a pause."""
+        """Go on after a pause.
+
+        Hooks start with the next event: one that started now would hold the pause of the other
+        nodes in the thread.
+        """
         if self._pause.is_on:
             self._pause.end(self._wake())
-            self._pass()
+            self._cause = self.rest()
+            if self._cause is SCHEDULING and not self._has_posted_loop_back:
+                self._has_posted_loop_back = True
+                self._effects.post_loop_back(self.on_loop_back)
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let each hook that starts unasked do so ``count`` times more.

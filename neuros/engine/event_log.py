@@ -149,8 +149,7 @@ class LoggedEngine(Engine):
         super().pause()
 
     def resume(self) -> None:
-        if not self._lifecycle.is_draining:  # a drain resumes by itself, here and in the replay
-            self._record(_entry(EventKind.RESUME))
+        self._record(_entry(EventKind.RESUME))
         super().resume()
 
     def step(self, count: int, *, is_driven: bool) -> None:

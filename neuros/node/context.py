@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Mapping
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -62,6 +63,19 @@ class Context:
         return file.startswith(self.project) and not file.startswith(_SHARED)
 
 
+class _Imported:
+    """Gives a node a module that the process has imported already."""
+
+    def __init__(self, module: ModuleType) -> None:
+        self._module = module
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return self._module
+
+    def exec_module(self, module: ModuleType) -> None:
+        """It has run."""
+
+
 class ContextSwitch:
     """Puts the context of one node at a time in place.
 
@@ -72,7 +86,10 @@ class ContextSwitch:
         self._process = Context({}, os.environ._data, sys.path)  # type: ignore[attr-defined]
         self._current = self._process
         self._known_modules = len(sys.modules)
+        # A library that the program has imported itself belongs to none of the nodes yet.
+        self._process.modules |= {n: sys.modules[n] for n in _FOR_ONE_NODE if n in sys.modules}
         self._owners: dict[str, Context] = {}
+        sys.meta_path.insert(0, self)
         # By the contexts before and after a switch, the variables in which nodes differ.
         self._differing: dict[tuple[Context, Context], list[Any]] = {}
 
@@ -178,26 +195,26 @@ class ContextSwitch:
             environ[os.environ.encodekey(key)] = os.environ.encodevalue(value)
         return environ
 
-    def find_spec(self, name: str, *_: object) -> None:
+    def find_spec(self, name: str, *_: object) -> ModuleSpec | None:
         """Part of the import system: refuse a library that another node has for itself."""
-        owner = self._owners.get(name)
-        if owner is not None and self._current not in (owner, self._process):
+        if name not in _FOR_ONE_NODE or self._current is self._process:
+            return None
+        if self._owners.setdefault(name, self._current) is not self._current:
             raise ImportError(
                 f"{_FOR_ONE_NODE[name]}, and another node of this process uses it: run the project"
                 " with --backend process"
             )
+        module = self._process.modules.get(name)
+        return None if module is None else ModuleSpec(name, _Imported(module))  # type: ignore[arg-type]
 
     def _find_modules(self, context: Context) -> None:
         """Note which modules of the process are private to a node."""
         for name, module in tuple(sys.modules.items()):
             if context.hides(module):
                 context.modules[name] = module
-        for name in _FOR_ONE_NODE:
-            if name in sys.modules and name not in self._owners and context is not self._process:
-                self._owners[name] = context
+        for name, owner in self._owners.items():
+            if name in sys.modules and context is owner:
                 context.modules[name] = self._process.modules[name] = sys.modules[name]
-                if self not in sys.meta_path:
-                    sys.meta_path.insert(0, self)
 
     def _set_variables(self, old: Context, new: Context) -> None:
         """Let C libraries see the variables that differ (``getenv``)."""

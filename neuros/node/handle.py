@@ -14,6 +14,7 @@ from neuros.engine.engine import Engine
 from neuros.errors import ModelError, NodeError
 from neuros.node.copies import copy_seeds
 from neuros.node.failures import Failures, as_node_error
+from neuros.node.keeping import Keeping
 from neuros.node.simulated_time import SimulatedTime
 from neuros.ports import EventLoop, Logger, Packets, WorldLook
 from neuros.project.model import Node, NodeFile
@@ -37,8 +38,9 @@ class PluginServices:
         is_active: set at time 0 of the run, when every node of the project is ready.
         is_ending: whether no further hook starts.
         results: what the plugin has noted.
+            keeping: what it keeps.
         make_packet: a new packet, for the type of a port.
-        time: that of the node, if it has one.
+            time: that of the node, if it has one.
         waiting_threads: those that wait until packets that they have offered are sent.
     """
 
@@ -52,6 +54,7 @@ class PluginServices:
         tell_progress: Callable[[str], object],
         show_world: Callable[[WorldLook], None],
         results: Results,
+        keeping: Keeping,
     ) -> None:
         self.engine: Engine | None = None
         self.is_ending = False
@@ -65,6 +68,7 @@ class PluginServices:
         self.tell_progress = tell_progress
         self.show_world = show_world
         self.results = results
+        self.keeping = keeping
         self.closers: list[Callable[[], None]] = []
 
     def stop(self) -> None:
@@ -267,6 +271,26 @@ class NodeHandle:
             self._services.results.set(name, value)
         except (TypeError, ValueError) as error:
             raise NodeError(f"set_result: '{name}' cannot be kept: {error}") from error
+
+    def keep(self, name: str, get: Callable[[], Any], put: Callable[[Any], object]) -> None:
+        """Keep a value, such as weights, beyond this run; call it in an initialise hook.
+
+        After the finalise hooks, what ``get()`` returns is written to ``kept/<name>.npz`` in
+        :attr:`run_dir`. Where a value of that name is restored (``--restore``, ``restore=`` of a
+        run or session), or survives a reset of a session (``keep=``), ``put(value)`` is called
+        before this returns. A plugin that stays loaded for a reset need not call it again:
+        ``put(value)`` is called after its reset hooks then.
+
+        Args:
+            get: returns a NumPy array, ``bytes``, ``str``, ``int``, ``float``, ``bool`` or
+                ``None``, or a ``list`` of these, or a ``dict`` of these with keys of type ``str``;
+                lists and dicts may be nested.
+            put: takes such a value, which is its own.
+
+        Raises:
+            NodeError: for a name that is none, or that is kept already; for what is no function.
+        """
+        self._services.keeping.register(name, get, put)
 
     def shutdown(self, reason: str = "", drain_s: float = 5.0) -> None:
         """End the project: drained within ``drain_s`` seconds, with exit code 0."""

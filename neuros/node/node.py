@@ -23,6 +23,7 @@ from neuros.node.context import ContextSwitch
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices, Results
 from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Tap
+from neuros.node.keeping import Keeping
 from neuros.node.logs import WorldLog
 from neuros.node.plugin import describe, last_line, load_plugin
 from neuros.node.reports import NodeReports
@@ -59,6 +60,7 @@ class NodeRuntime:
         engine: ``None`` until :meth:`load`.
         specs: the hooks of its plugin, once that is loaded; after a reset, those that hold then.
         handle: the ``node`` that hooks receive.
+        keeping: what its plugin keeps.
         failures: reports its errors.
         reports: what it says of itself.
     """
@@ -106,6 +108,7 @@ class NodeRuntime:
         self._guard = self.failures.guard
         self._time = SimulatedTime(file.node, duration_sim_s, clock, self._end_by_duration)
         sampler = Sampler()
+        self.keeping = Keeping(self.name, self.run_dir, file.restored)
         self._services = PluginServices(
             middleware.packets,
             middleware.loop,
@@ -115,6 +118,7 @@ class NodeRuntime:
             lambda text: tell(Progress(self.name, text)),
             lambda look: self.reports.show_world(look),
             Results(self.run_dir),
+            self.keeping,
         )
         self.handle = NodeHandle(file, ros_node, self._services)
         self._recorder: NodeRecorder | None = None
@@ -124,6 +128,8 @@ class NodeRuntime:
                 recorder, middleware.packets.encode, lambda: self._time.now_s, self._logger
             )
             instruments.append(self._recorder)
+        self._on_initialised = on_initialised
+        self._uninitialised = 0  # initialise hooks that have not run
         self._is_held, self._is_local = is_held, is_local
         packets = middleware.packets
         copy_of = (lambda port: packets.copier(port.type)) if is_local else None
@@ -138,13 +144,13 @@ class NodeRuntime:
             self._time,
             instruments,
             enter=self._enter,
-            on_ready=lambda: tell(Ready(self.name)),
-            on_initialised=on_initialised,
+            on_ready=self._note_ready,
+            on_initialised=self._note_initialised,
         )
         world_log = None if recorder is None else WorldLog(self.run_dir, self._logger)
         self.reports = NodeReports(
             *(file, middleware, self._transport, self._time, sampler, clock),
-            *(self._recorder, world_log),
+            *(self._recorder, world_log, lambda: self.keeping.names),
         )
         node, tap = file.node, self._effects.tap
         arrivals = {
@@ -226,21 +232,24 @@ class NodeRuntime:
             return f"the plugin of {self.name} has made ROS entities"
         return self._contexts.why_bound(self._context)
 
-    def reset(self, variables: Mapping[str, str]) -> None:
+    def reset(self, variables: Mapping[str, str], keep: Sequence[str] = ()) -> None:
         """Be as after :meth:`load`, with these variables in the environment.
 
-        It is paused, and stays so; nothing may be under way to it or from it. A plugin with reset
-        hooks stays loaded, and these take the place of its initialise hooks; any other is finalised
-        and loaded anew.
+        What the plugin keeps by the names of ``keep`` survives. The node is paused, and stays so;
+        nothing may be under way to it or from it. A plugin with reset hooks stays loaded, and these
+        take the place of its initialise hooks; any other is finalised and loaded anew.
 
         Raises:
             PluginError, HookError: as :meth:`load`.
+            NodeError: if it cannot keep what it is to.
         """
         is_kept = bool(self._resets)
         self._loaded.stop_hooks()
+        self._enter()
         if not is_kept:
-            self._enter()
             self._finalise_hooks()
+        self.keeping.begin_anew(keep, forgets=not is_kept)
+        if not is_kept:
             self._services.close()
             self.handle.set_user_data(None)
         environment = self._environment(variables)
@@ -293,6 +302,8 @@ class NodeRuntime:
         self._enter()
         if runs_hooks and self.engine is not None:
             self._finalise_hooks(lambda name: self._tell(Finalising(self.name, name)))
+            for name in () if self._uninitialised else self.keeping.names:
+                self._guard(partial(self.keeping.save, name))
         self._tell(Finalising(self.name, ""))
         if self._is_held and not self._is_local:
             self._save_packets()
@@ -384,7 +395,22 @@ class NodeRuntime:
         if self._is_held:
             self.engine.pause()
         self._time.clock = self.engine.sim_clock
+        self._uninitialised = sum(spec.kind is HookKind.INITIALISE for spec in self.specs)
         return self.engine
+
+    def _note_ready(self) -> None:
+        self._settle()
+        self._tell(Ready(self.name))
+
+    def _note_initialised(self) -> None:
+        self._uninitialised -= 1
+        self._settle()
+        self._on_initialised()
+
+    def _settle(self) -> None:
+        """Put what waits into values that were kept, once all initialise hooks have run."""
+        if not self._uninitialised:
+            self.keeping.settle()
 
     def _save_packets(self) -> None:
         """Leave the newest packets for a session, which may want to see what led to the end."""

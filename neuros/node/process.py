@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import neuros.control as control
 from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Advance, Message
@@ -152,7 +152,7 @@ class NodeProcess:
             self._begin_settling()
             return
         if isinstance(message, control.Reset):
-            self._reset(message.variables)
+            self._reset(message)
             return
         if isinstance(message, control.Resume):
             self._asked = None  # where the run goes freely, an answer would hold it again
@@ -238,7 +238,7 @@ class NodeProcess:
         self._asked, self._is_settling = None, False
         self._tell(_with_counters(_at_rest(self._nodes, asked), self._nodes))
 
-    def _reset(self, variables: Mapping[str, Mapping[str, str]]) -> None:
+    def _reset(self, asked: control.Reset) -> None:
         """Bring all nodes back to their start, once no event waits, if they can be."""
         assert self._middleware is not None
         loop = self._middleware.loop
@@ -246,12 +246,12 @@ class NodeProcess:
             for node in self._nodes:
                 node.pause()  # takes back what is left of steps, which might go on for ever
             if loop.has_waiting_events or not loop.has_taken_in:
-                loop.post_loop_back(lambda: self._reset(variables))
+                loop.post_loop_back(lambda: self._reset(asked))
                 return
             self._has_been_reset = True
             for node in self._nodes:
                 try:
-                    node.reset(variables.get(node.name, {}))
+                    node.reset(asked.variables.get(node.name, {}), asked.keep.get(node.name, ()))
                 except NeurosError as error:
                     self._fail(node.name, error)
                     return
@@ -302,7 +302,7 @@ class NodeProcess:
         self._tell(control.Loaded())
         self._may_begin.wait()  # meanwhile nothing of ROS is handled: nobody can send here
         if not self.is_ending:
-            middleware.loop.run()
+            self._guard(middleware.loop.run)
             middleware.take_in()
 
     def _begin(self) -> None:

@@ -36,6 +36,7 @@ class NodeReports:
     _clock: Callable[[], int]
     _recorder: NodeRecorder | None = None
     _world_log: WorldLog | None = None
+    _keeps: Callable[[], tuple[str, ...]] = tuple
     _engine: Engine | None = None
     _packet_log: PacketLog | None = None
     _has_begun: bool = False
@@ -131,6 +132,7 @@ class NodeReports:
             self._time.now_s,
             None if engine is None else live_counters(engine, self._clock()),
             self._sampler.ask(wanted, asker),
+            self._keeps(),
         )
 
     def probe(self, number: int, *, is_idle: bool, has_free_threads: bool) -> Probed:

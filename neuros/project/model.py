@@ -291,6 +291,7 @@ class NodeFile:
         messages: for ``sys.path``, the folder ``python`` of each built message package.
         names: the project's.
         list_bytes: limit of each list of the packet log; 0: the node keeps no log.
+        restored: by name of a value that its plugin keeps, the file that it came from.
     """
 
     node: Node
@@ -300,6 +301,12 @@ class NodeFile:
     messages: tuple[Path, ...] = ()
     names: Names = _NO_NAMES
     list_bytes: int = 64_000_000
+    restored: Mapping[str, str] = field(default_factory=lambda: _NOTHING, hash=False)
+
+    @property
+    def logger_name(self) -> str:
+        """The name of its logger in ROS, which rcl makes from namespace and name."""
+        return f"{self.names.namespace}/{self.node.name}"[1:].replace("/", ".")
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,7 @@ def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
         "messages": [str(path) for path in node_file.messages],
         "index": node_file.index,
         "list_bytes": node_file.list_bytes,
+        "restored": dict(node_file.restored),
         "file": str(node.file),
         "pointer": node.pointer,
         "environment_paths": list(node.environment_paths),
@@ -104,6 +105,7 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
         index=content["index"],
         messages=tuple(map(Path, content.get("messages", ()))),
         names=names,
+        restored=content.get("restored", {}),
         **({"list_bytes": content["list_bytes"]} if "list_bytes" in content else {}),
     )
 

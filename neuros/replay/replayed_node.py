@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import bdb
 import pdb
-import queue
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -30,12 +29,14 @@ from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.hooks import HookSpec
 from neuros.node.context import ContextSwitch
 from neuros.node.node import NodeRuntime
-from neuros.ports import Way
+from neuros.ports import Inbox, Way
 from neuros.project.model import Connection, NodeFile
 from neuros.replay.recorded_node import RecordedNode
-from neuros.runtime.null_middleware import HeldLoop, NullMiddleware
+from neuros.runtime.local import LocalLoop, LocalMiddleware, NoTopics
 from neuros.transport.envelope import Traffic
+from neuros.transport.memory import MemoryTransport
 from neuros.transport.messages import RosPackets
+from neuros.transport.ros_loop import RosLoop
 
 _POLL_S = 0.1
 _DEBUGPY_HOST = "127.0.0.1"
@@ -137,6 +138,36 @@ class Comparison:
             self.difference = f"{topic}: packet {number} differs in {field}"
 
 
+class _Loop(LocalLoop):
+    """Leaves to the script what the node posts itself, and handles events of threads only."""
+
+    def __init__(self, script: Script) -> None:
+        super().__init__()
+        self.post = script.deliveries.append
+        self.post_loop_back = partial(setattr, script, "loop_back")
+
+    def serve(self, ros: RosLoop) -> None:
+        """Callbacks of a plugin are no part of a replay."""
+
+
+class _ClosedTransport(MemoryTransport):
+    """Carries nothing: the script decides which packets arrive, and when."""
+
+    def open(self, inbox: Inbox) -> None:
+        """Stay closed."""
+
+
+class _Alone(LocalMiddleware):
+    """The middleware of one node without neighbours."""
+
+    def transport(self, file: NodeFile) -> MemoryTransport:
+        super().transport(file)
+        return _ClosedTransport(file, self.hub, NoTopics())
+
+    def bridge(self, file: NodeFile) -> NoTopics:
+        return NoTopics()
+
+
 class ReplayedNode:
     """One node of a run.
 
@@ -150,8 +181,8 @@ class ReplayedNode:
     def __init__(self, file: NodeFile, recorded: RecordedNode) -> None:
         self._file, self._recorded = file, recorded
         self._script = Script(recorded.event_log)
-        self._loop = HeldLoop(self._script.deliveries.append, self._set_loop_back)
-        self._middleware = NullMiddleware(file, self._loop)
+        self._loop = _Loop(self._script)
+        self._middleware = _Alone(self._loop, None, on_failure=lambda _: None)
         lacking = recorded.lacking()
         self.comparison = Comparison(recorded.sent(), recorded.message, lacking)
         self.failure: NeurosError | None = None
@@ -228,25 +259,21 @@ class ReplayedNode:
         """Wait for packets from a thread of the plugin, and give them to the engine."""
         self._engine.has_offer = False
         while not self._engine.has_offer:
-            try:
-                event = self._loop.from_threads.get(timeout=_POLL_S)
-            except queue.Empty:
-                if threading.active_count() > 1:
-                    continue
+            is_alone = threading.active_count() == 1
+            if self._loop.step():
+                continue
+            if is_alone:
                 raise ReplayParted(
                     "a thread of the plugin sent packets in the run, but no thread does in the"
                     " replay"
-                ) from None
-            event()
+                )
+            self._loop.wait(_POLL_S)
 
     @property
     def _engine(self) -> ReplayedEngine:
         engine: Engine | None = self._runtime.engine
         assert isinstance(engine, ReplayedEngine)
         return engine
-
-    def _set_loop_back(self, event: Callable[[], None]) -> None:
-        self._script.loop_back = event
 
     def _play(self) -> None:
         player = Player(self._script, self._engine, self._runtime, self)

@@ -1,31 +1,37 @@
 """The local runtime: nodes in the thread that calls, without ROS until something asks for it.
 
-Sessions and :class:`neuros.testing.PluginHarness` run nodes on it. Packets and acknowledgements are
-events of one queue. A ROS context is created for the first external topic, for topics that ROS
-tools are to see, and for a plugin that uses its ROS node. From then on, the loop serves ROS, too,
-after the events that wait.
+Sessions and :class:`neuros.testing.PluginHarness` run nodes on it, and the process of the back end
+``in-process``. Packets and acknowledgements are events of one queue. A ROS context is created for
+the first external topic, for topics that ROS tools are to see, and for a plugin that uses its ROS
+node. From then on, the loop serves ROS, too.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
+import queue
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neuros.ports import Inbox, Transport, Voice
+from neuros.ports import Inbox, Logger, Transport, TransportKind, Voice
 from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.project.names import SESSION
+from neuros.transport.imports_when_used import imports_when_used
 from neuros.transport.memory import GraphBridge, MemoryHub, MemoryTransport
 from neuros.transport.messages import RosPackets
+from neuros.transport.rclpy_patches import do_without_code_generator
 
 if TYPE_CHECKING:
-    from neuros.transport.lean_node import LeanNode
+    from neuros.transport.lean_node import Fail, LeanNode
     from neuros.transport.ros_loop import RosLoop
+    from neuros.transport.ros_process import RosProcess
 
 Event = Callable[[], None]
 
@@ -38,44 +44,59 @@ class LocalLoop:
     """Handles events in the order of posting (:class:`neuros.ports.EventLoop`).
 
     All packets go through one queue, so a loop-back arrives after all waiting events without a
-    queue of its own.
+    queue of its own. A session serves ROS itself, between rounds; :meth:`run` leaves all events to
+    the loop of ROS, once there is one.
 
     Args:
         clock: monotonic clock in nanoseconds.
 
     Attributes:
-        has_taken_in: always true, since nothing arrives but by events.
         post: handle an event after all waiting events.
-        ros: served after the events that wait, once there is ROS.
-        interruption: raised before the next event; any thread may set it.
+        ros: the loop of ROS, once there is one; see :meth:`serve`.
+        interruption: raised before the next event; see :meth:`interrupt`.
     """
-
-    has_taken_in = True
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self._clock = clock
         self._events: deque[Event] = deque()
-        self.post = self.post_loop_back = self._events.append
-        self._from_threads: deque[Event] = deque()
-        self._has_arrived = threading.Event()
+        self.post: Callable[[Event], None] = self._events.append
+        self.post_loop_back = self.post
+        # Also signal handlers post there, which the lock of threading.Event would hang.
+        self._from_threads: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._is_stopping = False
+        self._end_ns = 0
         self.ros: RosLoop | None = None
+        self._leader: RosLoop | None = None  # handles all events, from some time on
         self.interruption: BaseException | None = None
 
     @property
+    def has_taken_in(self) -> bool:
+        """Whether all arrivals have been handled: only those of ROS come by themselves."""
+        return self._leader is None or self._leader.has_taken_in
+
+    @property
     def has_waiting_events(self) -> bool:
-        return bool(self._events)
+        return bool(self._events) if self._leader is None else self._leader.has_waiting_events
+
+    def serve(self, ros: RosLoop) -> None:
+        """Serve ROS from now on. Any thread."""
+        self.ros = ros
+        self.post_from_thread(_nothing)
 
     def post_from_thread(self, event: Event) -> None:
-        self._from_threads.append(event)
-        self._has_arrived.set()
+        self._from_threads.put(event)
+        if self._leader is not None:
+            self._leader.post_from_thread(self._post_arrived)
 
     def note_execution(self) -> None:
-        """Nothing arrives during an execution."""
+        if self._leader is not None:
+            self._leader.note_execution()
 
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
         self._timers.append((next_due_ns, on_due))
+        if self._leader is not None:
+            self._leader.add_timer(next_due_ns, on_due)
 
     @property
     def next_due_ns(self) -> int | None:
@@ -93,17 +114,12 @@ class LocalLoop:
 
     def step(self) -> bool:
         """Handle the oldest event; returns whether there was one."""
-        while self._from_threads:
-            self._events.append(self._from_threads.popleft())
+        while not self._from_threads.empty():
+            self._events.append(self._from_threads.get())
         if self._is_stopping or not self._events:
             return False
         self._events.popleft()()
         return True
-
-    def run(self) -> None:
-        """Handle events until none is left, or until :meth:`stop`."""
-        while self.step():
-            pass
 
     def run_until_idle(self) -> None:
         """Handle events, those of ROS included, until none waits.
@@ -113,13 +129,13 @@ class LocalLoop:
         """
         events, from_threads = self._events, self._from_threads
         while not self._is_stopping:
-            if from_threads:
-                events.append(from_threads.popleft())
+            if not from_threads.empty():
+                events.append(from_threads.get())
             elif not events:
                 if self.ros is None:
                     return
                 self.ros.run_until_idle()
-                if not (events or from_threads):
+                if not events and from_threads.empty():
                     return
             if self.interruption is not None:
                 self._raise_interruption()
@@ -127,37 +143,89 @@ class LocalLoop:
                 events.popleft()()
 
     def run_for(self, seconds: float) -> None:
-        """Handle events and timers for a time on the wall clock, or until :meth:`stop`.
+        """Handle events, timers and ROS for a time on the wall clock, or until :meth:`end_run`.
 
         Raises:
             BaseException: the :attr:`interruption`; the events that wait are kept.
         """
-        end_ns = self._clock() + round(seconds * 1e9)
-        while not self._is_stopping and self._clock() < end_ns:
+        self._end_ns = self._clock() + round(seconds * 1e9)
+        ros_due_ns = 0
+        while (now_ns := self._clock()) < self._end_ns:
             if self.interruption is not None:
                 self._raise_interruption()
-            self._has_arrived.clear()
-            has_run = self.step()
-            self.run_due_timers()
-            if not has_run and not self._events and not self._from_threads:
-                self._wait(min(self.next_due_ns or end_ns, end_ns))
+            if self.ros is not None and now_ns >= ros_due_ns:
+                ros_due_ns = now_ns + round(_SLICE_S * 1e9)
+                self.ros.run_until_idle()
+            self._go_on(self._end_ns)
+
+    def end_run(self) -> None:
+        """End :meth:`run_for` after the current event."""
+        self._end_ns = 0
+
+    def run(self) -> None:
+        """Handle events and timers until :meth:`stop`; with ROS, in one queue with its events."""
+        while self.ros is None and not self._is_stopping:
+            self._go_on(None)
+        if self.ros is None:
+            return
+        ros = self._leader = self.ros
+        self.post, self.post_loop_back = ros.post, ros.post_loop_back
+        for timer in self._timers:
+            ros.add_timer(*timer)
+        for event in self._events:
+            ros.post(event)
+        self._events.clear()
+        self._post_arrived()
+        if not self._is_stopping:
+            ros.run()
+
+    def take_in(self) -> None:
+        """After :meth:`run`: handle what had arrived by then, so that it is counted."""
+        for _ in range(len(self._events)):
+            self._events.popleft()()
 
     def stop(self) -> None:
         """Handle no further event. Any thread."""
         self._is_stopping = True
-        self._has_arrived.set()
+        self.post_from_thread(_nothing)
+        if self.ros is not None:
+            self.ros.stop()
 
-    def _wait(self, until_ns: int) -> None:
-        left_s = max(0.0, (until_ns - self._clock()) / 1e9)
-        if self.ros is None:
-            self._has_arrived.wait(left_s)
-        else:
-            self.ros.run_for(min(left_s, _SLICE_S))
+    def interrupt(self, error: BaseException) -> None:
+        """Raise an error before the next event. Any thread, and a signal handler."""
+        self.interruption = error
+        self._from_threads.put(_nothing)
+
+    def wait(self, seconds: float | None) -> None:
+        """Wait for an event of another thread, or for ROS; not longer than this."""
+        if self.ros is not None:
+            self.ros.run_for(_SLICE_S if seconds is None else min(seconds, _SLICE_S))
+            return
+        if not self._is_stopping:  # else what tells of that may have been taken
+            with contextlib.suppress(queue.Empty):
+                self._events.append(self._from_threads.get(timeout=seconds))
+
+    def _go_on(self, end_ns: int | None) -> None:
+        """Handle the oldest event, or wait for one; then the timers that are due."""
+        if not self.step():
+            times = [ns for ns in (self.next_due_ns, end_ns) if ns is not None]
+            left_s = max(0.0, (min(times) - self._clock()) / 1e9) if times else None
+            self.wait(left_s)
+        if self._timers:
+            self.run_due_timers()
+
+    def _post_arrived(self) -> None:
+        while not self._from_threads.empty():
+            self.post(self._from_threads.get())
 
     def _raise_interruption(self) -> None:
         interruption, self.interruption = self.interruption, None
         assert interruption is not None
         raise interruption
+
+
+def _nothing() -> None:
+    """An event that only wakes the loop."""
 
 
 _LEVELS = {
@@ -232,7 +300,7 @@ class LocalRosNode:
     def __init__(
         self,
         name: str,
-        logger: LocalLogger,
+        logger: Logger,
         parameters: Mapping[str, Value],
         make: Callable[[str], Any],
     ) -> None:
@@ -246,8 +314,7 @@ class LocalRosNode:
     def get_name(self) -> str:
         return self._name
 
-    def get_logger(self) -> LocalLogger:
-        """The logger of the node, which is not that of ROS."""
+    def get_logger(self) -> Logger:
         return self._logger
 
     def has_parameter(self, name: str) -> bool:
@@ -281,7 +348,7 @@ class LocalRosNode:
         return getattr(self._real, attribute)
 
 
-class _NoTopics:
+class NoTopics:
     """A node without external topics (:class:`neuros.transport.memory.GraphBridge`)."""
 
     heard: tuple[Connection, ...] = ()
@@ -292,71 +359,61 @@ class _NoTopics:
     def close(self) -> None: ...
 
 
-class WithoutPeers:
-    """The part of a middleware that nodes without peers do not need."""
-
-    def join_peers(
-        self,
-        names: Sequence[str],
-        elsewhere: Sequence[str],
-        heard: Callable[[str, str | None], None],
-    ) -> Voice:
-        """There are no peers. Raises ``NotImplementedError``."""
-        raise NotImplementedError("these nodes have no peers")
-
-    def mark_own_entities(
-        self, file: NodeFile, enter: Event, fail: Callable[[Any, BaseException], None]
-    ) -> None:
-        """Nothing of it is served."""
-
-    def has_foreign_entities(self, file: NodeFile) -> bool:
-        """Nothing can call back."""
-        return False
-
-    def take_in(self) -> None:
-        """Nothing arrives by itself."""
-
-    def flush(self) -> None:
-        """Nothing is sent to anybody."""
-
-
-class LocalMiddleware(WithoutPeers):
+class LocalMiddleware:
     """Joins nodes in one thread (:class:`neuros.ports.Middleware`).
 
     Args:
-        write: is given each record of a log, after the name of its node.
+        loop: handles the events; ``None``: that of ROS, which is there from the start then.
+        write: is given each record of a log, after the name of its node; ``None``: nodes log as
+            ROS does.
         on_failure: is called with the errors of callbacks of ROS.
+        files: all nodes, where they share a process of their own.
         exposes: whether ROS tools see the topics of the connections.
+        debug: whether ROS logs DEBUG records, too.
         digest: makes a number of a packet, where digests are kept.
+        digests_of: whether they are kept of a connection.
     """
 
     def __init__(
         self,
-        loop: LocalLoop,
-        write: Callable[[str, Record], object],
+        loop: LocalLoop | None,
+        write: Callable[[str, Record], object] | None,
         on_failure: Callable[[BaseException], None],
         *,
+        files: Sequence[NodeFile] = (),
         exposes: bool = False,
+        debug: bool = False,
         digest: Callable[[Any], int | None] | None = None,
+        digests_of: Callable[[Connection], bool] = lambda _: True,
     ) -> None:
-        self.loop = loop
-        self.packets = RosPackets()
-        self.hub = MemoryHub(loop, self.packets.copier)
+        self._local = loop
         self._write = write
         self._on_failure = on_failure
+        self._files = files
         self._exposes = exposes
+        self._debug = debug
         self._digest = digest
-        self._ros: _Ros | None = None
-        self._ros_nodes: dict[str, LocalRosNode] = {}
-        self._marks: dict[str, tuple[Event, Callable[[Any, BaseException], None]]] = {}
+        self._digests_of = digests_of
+        self._ros: RosProcess | None = None
+        self._ros_nodes: dict[str, Any] = {}
+        self._marks: dict[str, Callable[[RosProcess], None]] = {}
+        self._transports: list[Transport] = []
+        self.loop: LocalLoop | RosLoop = loop or self._with_ros().loop
+        self.packets = RosPackets()
+        self.hub = MemoryHub(self.loop, self.packets.copier)
 
     def transport(self, file: NodeFile) -> Transport:
-        self._ros_nodes[file.node.name] = self.local_ros_node(
-            file, LocalLogger(file.node.name, self._write)
+        is_local = self._local is not None
+        self._ros_nodes[file.node.name] = (
+            self.local_ros_node(file, self._logger(file)) if is_local else self._ros_node(file)
         )
-        return MemoryTransport(file, self.hub, self.bridge(file), self._digest)
+        transport = MemoryTransport(
+            file, self.hub, self.bridge(file), self._digest, self._digests_of
+        )
+        self._transports.append(transport)
+        return transport
 
-    def local_ros_node(self, file: NodeFile, logger: LocalLogger) -> LocalRosNode:
+    def local_ros_node(self, file: NodeFile, logger: Logger) -> LocalRosNode:
         """What a plugin gets as its ROS node."""
         node = file.node
         return LocalRosNode(node.name, logger, node.parameters, lambda _: self._ros_node(file))
@@ -365,100 +422,122 @@ class LocalMiddleware(WithoutPeers):
         """The external topics of a node, and its place on the ROS graph."""
         topics = [p.external_topic for p in (*file.node.inputs, *file.node.outputs)]
         if not self._exposes and all(t is None or t.startswith(SESSION) for t in topics):
-            return _NoTopics()
+            return NoTopics()
         from neuros.transport.ros_graph import RosGraphBridge
 
-        ros_node = self._ros_node(file)
-        assert self._ros is not None
-        return RosGraphBridge(file, ros_node, self._ros.loop)
+        shown = file if self._exposes else replace(file, connections=())
+        return RosGraphBridge(shown, self._ros_node(file), self._with_ros().loop)
 
     def ros_node(self, file: NodeFile) -> Any:
         return self._ros_nodes[file.node.name]
 
-    def mark_own_entities(
-        self, file: NodeFile, enter: Event, fail: Callable[[Any, BaseException], None]
-    ) -> None:
-        self._marks[file.node.name] = enter, fail
-        if self._ros is not None and file.node.name in self._ros.nodes:
-            self._ros.mark(file, enter, fail)
+    def mark_own_entities(self, file: NodeFile, enter: Event, fail: Fail) -> None:
+        thread = threading.get_ident()
+        name = file.node.name
+        self._marks[name] = lambda ros: ros.mark_own_entities(file, enter, fail, thread)
+        if self._ros is not None and self._ros.has_node(file):
+            self._marks[name](self._ros)
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         return self._ros is not None and self._ros.has_foreign_entities(file)
 
+    def join_peers(
+        self,
+        names: Sequence[str],
+        elsewhere: Sequence[str],
+        heard: Callable[[str, str | None], None],
+    ) -> Voice:
+        return self._with_ros().join_peers(names, elsewhere, heard)
+
+    def take_in(self) -> None:
+        """Handle what had arrived when the loop ended, but for callbacks of plugins."""
+        if self._ros is not None:
+            self._ros.take_in()
+        if self._local is not None:
+            self._local.take_in()
+
+    def flush(self) -> None:
+        """Send and receive nothing any more, and let what was sent last leave."""
+        for transport in self._transports:
+            transport.close()
+        if self._ros is not None:
+            self._ros.flush()
+
     def close(self) -> None:
         """Give up ROS, if it was used."""
-        if self._ros is not None:
-            self._ros.close()
-            self._ros = self.loop.ros = None
+        ros, self._ros = self._ros, None
+        if ros is not None:
+            ros.close(may_stay=bool(self._files))
+        if self._local is not None:
+            self._local.ros = None
+
+    def _logger(self, file: NodeFile) -> Logger:
+        if self._write is not None:
+            return LocalLogger(file.node.name, self._write)
+        from rclpy.logging import LoggingSeverity, get_logger
+
+        logger: Logger = get_logger(file.logger_name)
+        if self._debug:
+            logger.set_level(LoggingSeverity.DEBUG)  # type: ignore[attr-defined]
+        return logger
 
     def _ros_node(self, file: NodeFile) -> LeanNode:
         """The real ROS node of a node, made when it is asked for first."""
+        ros = self._with_ros()
+        is_new = not ros.has_node(file)
+        ros_node = ros.ros_node(file)
+        if is_new and file.node.name in self._marks:
+            self._marks[file.node.name](ros)
+        return ros_node
+
+    def _with_ros(self) -> RosProcess:
+        """The part of ROS in this process, made when it is asked for first."""
         if self._ros is None:
-            self._ros = _Ros(self._on_failure)
-            self.loop.ros = self._ros.loop
-        if file.node.name not in self._ros.nodes:
-            self._ros.add(file)
-            if file.node.name in self._marks:
-                self._ros.mark(file, *self._marks[file.node.name])
-        return self._ros.nodes[file.node.name]
+            from neuros.transport.dds_profile import RANGE_VARIABLE
+
+            with imports_when_used():
+                from neuros.transport.ros_process import RosProcess
+
+            os.environ.setdefault(RANGE_VARIABLE, "LOCALHOST")
+            self._ros = RosProcess(self._files, self._on_failure, debug=self._debug)
+            if self._local is not None:
+                self._local.serve(self._ros.loop)
+        return self._ros
 
 
-class _Ros:
-    """ROS for local nodes: its context, its loop and the real ROS nodes.
+class _OneProcess(TransportKind):
+    """``memory``, with topics on the ROS graph, and ``local``, with ROS where nodes ask for it."""
 
-    Attributes:
-        nodes: by name.
-    """
+    def __init__(self, name: str, *, has_ros: bool) -> None:
+        self.name = name
+        self._has_ros = has_ros
 
-    def __init__(self, on_failure: Callable[[BaseException], None]) -> None:
-        import rclpy
-        from rclpy.signals import SignalHandlerOptions
-
-        from neuros.transport.dds_profile import RANGE_VARIABLE, dds_environment
-        from neuros.transport.rclpy_patches import do_without_code_generator
-        from neuros.transport.ros_loop import RosLoop
+    def middleware(
+        self,
+        files: Sequence[NodeFile],
+        on_failure: Callable[[BaseException], None],
+        *,
+        digests: bool,
+        record: bool,
+        debug: bool,
+    ) -> LocalMiddleware:
+        from neuros.transport.digests import TriedDigest, digest_of
 
         do_without_code_generator()
-        os.environ.setdefault(RANGE_VARIABLE, "LOCALHOST")
-        os.environ.update(dds_environment(os.environ))
-        self._context = rclpy.Context()
-        rclpy.init(
-            args=["--ros-args", "--disable-external-lib-logs"],
-            context=self._context,
-            signal_handler_options=SignalHandlerOptions.NO,
+        is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
+        tried = TriedDigest() if is_lossless and not record else None
+        return LocalMiddleware(
+            None if self._has_ros else LocalLoop(),
+            None,
+            on_failure,
+            files=files,
+            exposes=self._has_ros,
+            debug=debug,
+            digest=digest_of if digests or record else tried,
+            # Of what is recorded, digests only tell which packets have arrived.
+            digests_of=lambda c: digests or not (record and c.is_reliable),
         )
-        self.loop = RosLoop(self._context, on_failure)
-        self.nodes: dict[str, LeanNode] = {}
-        self._own: dict[str, set[int]] = {}
-        self._callbacks: list[Any] = []
 
-    def add(self, file: NodeFile) -> None:
-        from neuros.transport.lean_node import lean_node
 
-        self.nodes[file.node.name] = ros_node = lean_node(file, self._context)
-        self.loop.add_node(ros_node)
-
-    def mark(
-        self, file: NodeFile, enter: Event, fail: Callable[[Any, BaseException], None]
-    ) -> None:
-        from neuros.transport.lean_node import PluginCallbacks, entities
-
-        ros_node = self.nodes[file.node.name]
-        self._own[file.node.name] = entities(ros_node)
-        self._callbacks.append(PluginCallbacks(ros_node, self.loop, enter, fail))
-
-    def has_foreign_entities(self, file: NodeFile) -> bool:
-        from neuros.transport.lean_node import entities
-
-        ros_node = self.nodes.get(file.node.name)
-        if ros_node is None:
-            return False
-        return not entities(ros_node) <= self._own.get(file.node.name, set())
-
-    def close(self) -> None:
-        from neuros.transport.lean_node import give_up
-
-        for callbacks in self._callbacks:
-            callbacks.close()
-        self.loop.close()
-        give_up(self._context, self.nodes.values())
+MEMORY = _OneProcess("memory", has_ros=True)
+LOCAL = _OneProcess("local", has_ros=False)

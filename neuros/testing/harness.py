@@ -28,6 +28,7 @@ from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 from neuros.node.context import ContextSwitch
 from neuros.node.handle import NodeHandle
+from neuros.node.keeping import restore_values
 from neuros.node.node import NodeRuntime
 from neuros.node.plugin import no_module
 from neuros.project.in_python import Plugin, functions_of, plugin_key
@@ -91,7 +92,7 @@ class Neighbours:
             self._started[connection] = position
             if connection.is_reliable:
                 node = self._hub.inboxes[connection.source_node]
-                self._hub.post(partial(node.on_acknowledgement, connection, position))
+                self._hub.loop.post(partial(node.on_acknowledgement, connection, position))
 
     # ------------------------------------------------------------------ inbox
 
@@ -117,7 +118,7 @@ class Neighbours:
         while waiting and not window.is_blocked:
             window.spend(0)
             node = self._hub.inboxes[connection.destination_node]
-            self._hub.post(partial(node.on_packet, connection, waiting.popleft()))
+            self._hub.loop.post(partial(node.on_packet, connection, waiting.popleft()))
 
 
 class PluginHarness:
@@ -184,6 +185,7 @@ class PluginHarness:
         name: the node's name.
         copies: its number of copies; the types of the ports are those of one.
         run_folder: the run folder, a temporary one if not given.
+        restore: values that the plugin gets back by ``node.keep``, by name.
 
     Raises:
         PluginError, HookError: if the plugin cannot be imported, or declares its hooks wrongly.
@@ -202,6 +204,7 @@ class PluginHarness:
         name: str = "node",
         copies: int | None = None,
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> None:
         hooks, module = functions_of(plugin), ""
         if hooks:
@@ -228,7 +231,7 @@ class PluginHarness:
         )
         wires = with_neighbours(node, connections)
         project = path.parent if path.exists() else Path.cwd()
-        self._open(node, wires, project, WORKSPACE, run_folder)
+        self._open(node, wires, project, WORKSPACE, run_folder, restore)
 
     @classmethod
     def from_project(
@@ -240,6 +243,7 @@ class PluginHarness:
         overrides: Sequence[str] = (),
         workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> PluginHarness:
         """A node of a project, with its connections in that project.
 
@@ -261,7 +265,8 @@ class PluginHarness:
         node = _with_environment(loaded.node(node_name), environment)
         own = [c for c in loaded.connections if node_name in (c.source_node, c.destination_node)]
         harness = cls.__new__(cls)
-        harness._open(node, with_observer(node, own), loaded.folder, workspace, run_folder)
+        wires = with_observer(node, own)
+        harness._open(node, wires, loaded.folder, workspace, run_folder, restore)
         return harness
 
     @classmethod
@@ -273,6 +278,7 @@ class PluginHarness:
         environment: Mapping[str, str] | None = None,
         workspace: Path = WORKSPACE,
         run_folder: Path | None = None,
+        restore: Mapping[str, Any] | None = None,
     ) -> PluginHarness:
         """The node that a node file describes; each port has a connection, as in the constructor.
 
@@ -290,7 +296,7 @@ class PluginHarness:
         node = _with_environment(loaded.nodes[0], environment)
         harness = cls.__new__(cls)
         wires = with_neighbours(node, connections)
-        harness._open(node, wires, file.parent, workspace, run_folder)
+        harness._open(node, wires, file.parent, workspace, run_folder, restore)
         return harness
 
     def _open(
@@ -300,6 +306,7 @@ class PluginHarness:
         project: Path,
         workspace: Path,
         run_folder: Path | None,
+        restore: Mapping[str, Any] | None,
     ) -> None:
         if run_folder is None:
             folder = Path(tempfile.mkdtemp(prefix="neuros-"))
@@ -308,7 +315,8 @@ class PluginHarness:
             folder = run_folder.resolve()
         messages = provide_messages(node, workspaces_of(project, workspace))
         folders = Folders(project, workspace, folder)
-        file = NodeFile(node, connections, folders, messages=messages)
+        restored = restore_values(restore or {}, folder / node.name)
+        file = NodeFile(node, connections, folders, messages=messages, restored=restored)
         self.log: list[Record] = []
         self.shutdown_reason: str | None = None
         self._file = file
@@ -405,6 +413,12 @@ class PluginHarness:
     def run_dir(self) -> Path:
         """The node's own folder."""
         return self._runtime.run_dir
+
+    @property
+    def kept(self) -> dict[str, Any]:
+        """What the plugin keeps (``node.keep``), by name: its values of now."""
+        with self._in_context():
+            return self._runtime.keeping.values()
 
     @property
     def time_s(self) -> float:

@@ -8,11 +8,10 @@ from types import MappingProxyType
 from typing import Any
 
 from neuros.errors import NodeError
-from neuros.ports import Inbox
+from neuros.ports import Inbox, Logger
 from neuros.project.message_types import in_full, normalised, with_copies, wrong_array
 from neuros.project.model import Connection, Node, NodeFile, Port, Value
 from neuros.runtime.local import (
-    LocalLogger,
     LocalLoop,
     LocalMiddleware,
     LocalRosNode,
@@ -57,7 +56,7 @@ class RosNodeStandIn(LocalRosNode):
     def __init__(
         self,
         name: str,
-        logger: LocalLogger,
+        logger: Logger,
         parameters: Mapping[str, Value] = _NOTHING,
         topics: Mapping[str, tuple[str, int, int]] = MappingProxyType({}),
     ) -> None:
@@ -124,7 +123,7 @@ class Workbench(LocalMiddleware):
         super().__init__(loop, write, _raise)
         self._topics = topics
 
-    def local_ros_node(self, file: NodeFile, logger: LocalLogger) -> LocalRosNode:
+    def local_ros_node(self, file: NodeFile, logger: Logger) -> LocalRosNode:
         node = file.node
         return RosNodeStandIn(node.name, logger, node.parameters, _topics_of(file))
 

@@ -201,16 +201,22 @@ class PluginCallbacks:
         loop: serves the node.
         enter: called before each part of a callback that runs in one go.
         fail: is given a callback and what it has raised; no other is called from then on.
+        thread: the loop runs hooks and callbacks in it; by default this one.
     """
 
     def __init__(
-        self, ros_node: LeanNode, loop: RosLoop, enter: Callable[[], None], fail: Fail
+        self,
+        ros_node: LeanNode,
+        loop: RosLoop,
+        enter: Callable[[], None],
+        fail: Fail,
+        thread: int | None = None,
     ) -> None:
         self.loop = loop
         self.is_closed = False
         self._enter = enter
         self._fail = fail
-        self._thread = threading.get_ident()  # in which the loop runs hooks and callbacks
+        self._thread = threading.get_ident() if thread is None else thread
         ros_node.callbacks = self
 
     def close(self) -> None:

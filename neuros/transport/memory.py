@@ -46,7 +46,6 @@ class MemoryHub:
         copier: Callable[[str], Callable[[Any], Any]],
     ) -> None:
         self.loop = loop
-        self.post = loop.post
         self.copier = copier
         self.arrivals: dict[str, _Arrivals] = defaultdict(_Arrivals)
         self.inboxes: dict[str, Inbox] = {}
@@ -74,7 +73,7 @@ class MemoryHub:
             self.inboxes[name] = _Nobody()
 
     def _register(self, connection: Connection) -> None:
-        self.post(lambda: self.inboxes[connection.source_node].on_registered(connection))
+        self.loop.post(lambda: self.inboxes[connection.source_node].on_registered(connection))
 
 
 class MemoryTransport:
@@ -188,7 +187,7 @@ class MemoryTransport:
         """
         if self._loop.has_waiting_events:
             self._is_turn_of_others = True
-            self._hub.post(self._end_turn_of_others)
+            self._hub.loop.post(self._end_turn_of_others)
 
     def has_taken_in(self) -> bool:
         return (
@@ -291,14 +290,14 @@ class MemoryLink:
         """Put a packet on its way, with its digest if that is kept."""
         if len(self._packets) < self._window:  # else an event is on its way for one that is lost
             self._arrivals.sent += 1
-            self._hub.post(self._receive)
+            self._hub.loop.post(self._receive)
         self._packets.append((packet, digest))
 
     def acknowledge(self, position: int) -> None:
         """Put the acknowledgement of a position on its way back."""
         self._arrivals_back.sent += 1
         self._positions.append(position)
-        self._hub.post(self._receive_position)
+        self._hub.loop.post(self._receive_position)
 
     def forget_digests(self) -> None:
         """Keep none of the packets so far, nor of those on their way."""

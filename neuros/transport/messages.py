@@ -48,9 +48,10 @@ def packet_kind(type_name: str) -> Any:
 
 def kind_of(packet: Any) -> Any:
     """What a packet is, as :func:`packet_kind` has it."""
-    if isinstance(packet, numpy.ndarray):
-        return _kind_of_array(packet.dtype, packet.shape)
-    return type(packet)
+    kind = type(packet)
+    if hasattr(kind, "get_fields_and_field_types"):  # a message, which needs no NumPy
+        return kind
+    return _kind_of_array(packet.dtype, packet.shape)
 
 
 @cache

@@ -11,10 +11,12 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import rclpy.task
-from rclpy.node import Node as RosNode
+
+if TYPE_CHECKING:
+    from rclpy.node import Node as RosNode
 
 OnFailure: TypeAlias = Callable[[BaseException], None]
 

@@ -27,7 +27,6 @@ from neuros.ports import Transport, TransportKind
 from neuros.project.model import NodeFile
 from neuros.project.names import INTERNAL
 from neuros.transport.dds_profile import dds_environment
-from neuros.transport.digests import TriedDigest, digest_of
 from neuros.transport.lean_node import (
     Fail,
     LeanNode,
@@ -36,11 +35,9 @@ from neuros.transport.lean_node import (
     give_up,
     lean_node,
 )
-from neuros.transport.memory import MemoryHub, MemoryTransport
 from neuros.transport.messages import RosPackets
 from neuros.transport.rclpy_patches import do_without_code_generator, keep_to_the_end
 from neuros.transport.ros import RosTransport
-from neuros.transport.ros_graph import RosGraphBridge
 from neuros.transport.ros_loop import RosLoop
 
 _LINGER_S = 0.05
@@ -58,13 +55,12 @@ _CROWD = 16
 
 
 class RosProcess:
-    """The :class:`neuros.ports.Middleware` of one node, or (``in_memory``) of all of a project.
+    """ROS in a process: its context, its loop and its ROS nodes.
+
+    It is the :class:`neuros.ports.Middleware` of a node that has its process for itself.
 
     Args:
-        digests: whether digests are kept in memory, too, where a packet is serialised only for
-            its digest. Without losses they are kept anyway, if they are cheap.
-        record: whether packets go to a bag. Digests then only tell which packets have arrived, on
-            connections that may lose some.
+        files: the nodes of the process.
     """
 
     def __init__(
@@ -72,20 +68,16 @@ class RosProcess:
         files: Sequence[NodeFile],
         on_failure: Callable[[BaseException], None],
         *,
-        in_memory: bool,
-        digests: bool = False,
-        record: bool = False,
         debug: bool = False,
     ) -> None:
+        do_without_code_generator()
         self._files = files
         os.environ.update(dds_environment(os.environ))
         self._context = rclpy.Context()
         # rcl would write each record to a second log file, which costs as much as a packet.
         arguments = ["--ros-args", "--disable-external-lib-logs"]
         for file in files if debug else ():
-            # rcl makes the logger's name from namespace and name.
-            logger = f"{file.names.namespace}/{file.node.name}"[1:].replace("/", ".")
-            arguments += ["--log-level", f"{logger}:=debug"]
+            arguments += ["--log-level", f"{file.logger_name}:=debug"]
         rclpy.init(
             args=arguments,
             context=self._context,
@@ -93,47 +85,46 @@ class RosProcess:
         )
         self.loop = RosLoop(self._context, on_failure)
         self.packets = RosPackets()
-        self._has_digests = digests
-        is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
-        self._tried_digest = TriedDigest() if is_lossless and not record else None
-        self._is_recorded = record
-        self._hub = MemoryHub(self.loop, self.packets.copier) if in_memory else None
         self._ros_nodes: dict[str, LeanNode] = {}
         self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
         self._transports: list[Transport] = []
 
     def transport(self, file: NodeFile) -> Transport:
-        ros_node = lean_node(file, self._context)
-        self._ros_nodes[file.node.name] = ros_node
-        self.loop.add_node(ros_node)
-        transport: Transport
-        if self._hub is None:
-            transport = RosTransport(file, ros_node, self.loop)
-        else:
-            is_asked = self._has_digests or self._is_recorded
-            transport = MemoryTransport(
-                file,
-                self._hub,
-                RosGraphBridge(file, ros_node, self.loop),
-                digest_of if is_asked else self._tried_digest,
-                lambda c: not self._is_recorded or self._has_digests or not c.is_reliable,
-            )
+        transport = RosTransport(file, self.ros_node(file), self.loop)
         self._transports.append(transport)
         return transport
 
     def ros_node(self, file: NodeFile) -> LeanNode:
-        return self._ros_nodes[file.node.name]
+        """The ROS node of a node, made when it is asked for first."""
+        name = file.node.name
+        if name not in self._ros_nodes:
+            self._ros_nodes[name] = lean_node(file, self._context)
+            self.loop.add_node(self._ros_nodes[name])
+        return self._ros_nodes[name]
 
-    def mark_own_entities(self, file: NodeFile, enter: Callable[[], None], fail: Fail) -> None:
-        """Remember what exists on a ROS node before its plugin gets hold of it."""
+    def has_node(self, file: NodeFile) -> bool:
+        """Whether the ROS node of a node has been made."""
+        return file.node.name in self._ros_nodes
+
+    def mark_own_entities(
+        self,
+        file: NodeFile,
+        enter: Callable[[], None],
+        fail: Fail,
+        thread: int | None = None,
+    ) -> None:
+        """Remember what exists on a ROS node before its plugin gets hold of it.
+
+        ``thread`` runs the hooks; by default this one.
+        """
         ros_node = self.ros_node(file)
         self._own_entities[file.node.name] = entities(ros_node)
-        self._callbacks.append(PluginCallbacks(ros_node, self.loop, enter, fail))
+        self._callbacks.append(PluginCallbacks(ros_node, self.loop, enter, fail, thread))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         own = self._own_entities.get(file.node.name, set())
-        return not entities(self.ros_node(file)) <= own
+        return self.has_node(file) and not entities(self.ros_node(file)) <= own
 
     def join_peers(
         self,
@@ -146,8 +137,7 @@ class RosProcess:
 
     def take_in(self) -> None:
         """Handle what had arrived when the loop ended, but for callbacks of plugins."""
-        for callbacks in self._callbacks:
-            callbacks.close()
+        self._close_callbacks()
         self.loop.take_in()
 
     def flush(self) -> None:
@@ -156,20 +146,25 @@ class RosProcess:
             transport.close()
         self.loop.run_for(_LINGER_S)
 
-    def close(self) -> None:
-        """Close the loop and ROS. In a crowd, ROS stays open until the process ends.
+    def close(self, *, may_stay: bool = True) -> None:
+        """Close the loop and ROS. In a crowd, ROS may stay open until the process ends.
 
         Other processes of a crowd then notice after 20 s that this one has gone, as if it had been
         killed; the shared memory of DDS is left to the reaper.
         """
+        self._close_callbacks()
         self.loop.close()
         others: set[str] = set()
         for ros_node in [*self._ros_nodes.values()][:1]:  # each lists the whole domain
             others = {*ros_node.get_node_names()} - {*self._ros_nodes}
-        if len(others) > _CROWD:
+        if may_stay and len(others) > _CROWD:
             keep_to_the_end(self._ros_nodes.values())
         else:
             give_up(self._context, self._ros_nodes.values())
+
+    def _close_callbacks(self) -> None:
+        for callbacks in self._callbacks:
+            callbacks.close()
 
 
 # ---------------------------------------------------------------------- peers
@@ -269,11 +264,9 @@ def _qos(lease_s: float) -> QoSProfile:
 
 
 class _Rclpy(TransportKind):
-    """``ros``, between processes, and ``memory``, for nodes of one process."""
+    """``ros``: nodes in processes of their own, or in containers."""
 
-    def __init__(self, name: str, *, in_memory: bool) -> None:
-        self.name = name
-        self._in_memory = in_memory
+    name = "ros"
 
     def middleware(
         self,
@@ -284,16 +277,7 @@ class _Rclpy(TransportKind):
         record: bool,
         debug: bool,
     ) -> RosProcess:
-        do_without_code_generator()
-        return RosProcess(
-            files,
-            on_failure,
-            in_memory=self._in_memory,
-            digests=digests,
-            record=record,
-            debug=debug,
-        )
+        return RosProcess(files, on_failure, debug=debug)
 
 
-ROS = _Rclpy("ros", in_memory=False)
-MEMORY = _Rclpy("memory", in_memory=True)
+ROS = _Rclpy()

@@ -48,11 +48,12 @@ def test_every_run_has_what_is_wanted_of_it(made):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_new_views_are_learnt_and_the_old_ones_are_not_forgotten(made, tmp_path, seed):
     settings = (
-        f"pcn.environment.WEIGHTS={made / f'runs/training-{seed}/trainer/weights.npz'}",
         f"snn.environment.SEED={seed}",
         f"robot.environment.SEED={seed}",
     )
     arguments = [word for each in settings for word in ("--set", f"nodes.{each}")]
+    weights = made / f"runs/training-{seed}/trainer/weights.npz"
+    arguments += ["--restore", f"pcn.weights={weights}"]
     options = {"cwd": tmp_path, "timeout_s": TIMEOUT_S, "NEUROS_GUI": "0"}
     run = launch(WHISKEYE / "learning.json", "--backend", "process", *arguments, **options)
     assert run.exit_code == 0, run.output

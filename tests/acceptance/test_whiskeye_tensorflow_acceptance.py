@@ -102,8 +102,8 @@ def test_another_run_learns_the_same_bit_for_bit(by_tensorflow, tmp_path):
 def test_the_network_in_numpy_takes_its_weights(by_tensorflow, tmp_path):
     pytest.importorskip("nest")
     weights = by_tensorflow.run_folder / "trainer/weights.npz"
-    settings = (f"pcn.environment.WEIGHTS={weights}", "robot.environment.DURATION=2")
-    arguments = [word for each in settings for word in ("--set", f"nodes.{each}")]
+    restore = ("--restore", f"pcn.weights={weights}")
+    arguments = (*restore, "--set", "nodes.robot.environment.DURATION=2")
     run = launch(
         WHISKEYE / "prediction.json",
         *("--backend", "process", *arguments),

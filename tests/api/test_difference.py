@@ -360,3 +360,19 @@ def test_a_run_that_ends_before_what_the_other_has_kept_is_different(
     b = run(folders[1], {FIRST: [1, 2, 3, 4]})
     forget_the_first(folders[1], 3)
     assert verdict(a, b).difference == f"{FIRST}: run A ends after packet 2, run B has more (2)"
+
+
+def test_other_values_that_plugins_keep_are_a_note(tmp_path: Path) -> None:
+    runs = []
+    for name, kept, restored in (("a", "1", "2"), ("b", "1", "3"), ("c", "4", "2")):
+        (tmp_path / name).mkdir()
+        made = run(tmp_path / name, {FIRST: [7]})
+        values = {"kept": {"w": {"sha256": kept, "bytes": 1}}}
+        values |= {"restored": {"w": {"sha256": restored, "bytes": 1, "from": name}}}
+        runs.append(PastRun(made.folder, {**made.record, "nodes": {"a": values, f"of_{name}": {}}}))
+    a, b, c = runs
+    assert compare(a, a, Bags()).remarks == ()
+    verdict = compare(a, b, Bags())
+    assert verdict.remarks == ("a.w: another value was restored in run B",)
+    assert verdict.difference is None
+    assert compare(a, c, Bags()).remarks == ("a.w: another value was kept in run B",)

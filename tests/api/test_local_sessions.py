@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Iterator
@@ -359,3 +360,53 @@ class TestHistory:
             poses.array("date")
         with pytest.raises(UsageError, match="every=0"):
             stepped.probe("robot.pose", every=0)
+
+
+NEST_IN_THE_PROGRAM = """
+import sys
+import nest
+import neuros
+from neuros.errors import UsageError
+
+nest.Create("iaf_psc_alpha", 5)
+with neuros.Project.from_file("plain").session(backend="local") as s:
+    s.step()
+    s.reset()
+    assert not s.runs, "NEST is the program's, and binds no node"
+    assert nest.network_size == 5
+with neuros.Project.from_file("spiking").session(backend="local") as s:
+    for _ in range(2):
+        s.step()
+        assert s["a.x"].packet.data == 3.0, "NEST begins anew"
+        s.reset()
+    assert len(s.runs) == 2
+    try:
+        neuros.Project.from_file("spiking").session(backend="local")
+    except UsageError as error:
+        assert "NEST has one kernel per process" in str(error)
+    else:
+        sys.exit("two sessions use NEST at once")
+"""
+SPIKING = """
+import nest
+from neuros.hooks import neuros_function, neuros_initialise
+
+@neuros_initialise()
+def begin(node):
+    nest.Create("iaf_psc_alpha", 3)
+
+@neuros_function(outputs="x")
+def go(node):
+    x = node.make_packet("x")
+    x.data = float(nest.network_size)
+    return x
+"""
+
+
+def test_nest_is_the_programs_until_a_node_uses_it(tmp_path: Path) -> None:
+    for name, plugin in (("plain", INTERRUPTED.replace("== 1.0", "== -1.0")), ("spiking", SPIKING)):
+        (tmp_path / name).mkdir()
+        project_of(tmp_path / name, plugin)
+    program = [sys.executable, "-W", "ignore", "-c", NEST_IN_THE_PROGRAM]
+    run = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr

@@ -18,10 +18,10 @@ from neuros.errors import NeurosError
 from .description import Project
 from .judge import Violation
 from .projects import drawn
-from .running import LoadMeter
+from .running import LOCAL, WITHOUT_ROS, LoadMeter
 from .search import KEPT, Case, Verdict, keep, shrunk, verdict_of, verdicts
 
-BACKENDS = ("in-process", "process", "docker")
+BACKENDS = ("in-process", "process", "docker", LOCAL, WITHOUT_ROS)
 
 
 def main() -> int:

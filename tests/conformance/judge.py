@@ -126,7 +126,7 @@ class Judge:
         self.project = project
         self.seen = observed
         self.tolerance_ns = _TOLERANCE_NS + _LOADS * observed.late_ns
-        self.is_one_process = observed.backend == "in-process"
+        self.is_one_process = observed.is_one_process
         self.hooks = {(node.name, hook.name): hook for node in project.nodes for hook in node.hooks}
         self.log = {node.name: observed.executions.get(node.name, []) for node in project.nodes}
         self.runs: dict[tuple[str, str], list[Execution]] = {key: [] for key in self.hooks}
@@ -805,7 +805,7 @@ class Judge:
                 yield Violation("end", f"exit code 130: {reason}")
         elif code != 0:
             yield Violation("end", f"exit code {code}: {reason}")
-        if not self._is_deadlock and self.is_dead and code != 1:
+        if self.seen.looks_for_deadlocks and not self._is_deadlock and self.is_dead and code != 1:
             rested_s = (self.end_ns - self.last_start_ns) / 1e9
             if rested_s > _DEAD_AFTER_S:
                 yield Violation("end", f"dead for {rested_s:.1f} s, and no word of a deadlock")

@@ -6,6 +6,9 @@ import bisect
 import contextlib
 import json
 import os
+import signal
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -15,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.api.live import LiveRun
-from neuros.api.project import Project as Loaded
+from neuros.api.project import _project_of
 from neuros.backends.domain import choose_domain
 from neuros.errors import NeurosError
 
@@ -24,6 +27,13 @@ from .description import Project
 LONGEST_S = 30.0
 """After so long a run that has not ended by itself is ended, and judged as one that did not."""
 
+LOCAL, WITHOUT_ROS = "local", "no-ros"
+"""A session that runs freely, in a program of its own; in process, with ``--no-ros``."""
+
+_BACK_ENDS: Mapping[str, Mapping[str, Any]] = {
+    WITHOUT_ROS: {"backend": "in-process", "backend_options": {"ros": False}}
+}
+_ROOT = Path(__file__).parents[2]
 _UNBEGUN_S = 6.0
 _PATIENCE_S = 15.0
 _POLL_S = 0.02
@@ -73,6 +83,16 @@ class Observed:
     is_overdue: bool = False
     error: str = ""
     logs: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def is_one_process(self) -> bool:
+        """Whether nodes took turns in one thread."""
+        return self.backend not in ("process", "docker")
+
+    @property
+    def looks_for_deadlocks(self) -> bool:
+        """Whether a deadlock ends the run; the program that holds a session decides for itself."""
+        return self.backend != LOCAL
 
     @property
     def exit_code(self) -> int:
@@ -142,9 +162,14 @@ def run_in(
     # Projects with external topics would all go to domain 0, and hear each other.
     with choose_domain(None, {}, False) as domain:
         try:
-            live = Loaded(file, {}).start(
-                backend=backend, duration=duration, output=run_folder, domain_id=domain.id
-            )
+            live: LiveRun | _Program
+            if backend == LOCAL:
+                live = _Program(file, run_folder, duration or 2 * LONGEST_S, domain.id)
+            else:
+                named = _BACK_ENDS.get(backend, {"backend": backend})
+                live = _project_of(file, {}).start(
+                    duration=duration, output=run_folder, domain_id=domain.id, **named
+                )
             _wait(live, project, run_folder, seconds, observed)
         except NeurosError as error:
             observed.error = str(error)
@@ -158,8 +183,43 @@ def run_in(
     return observed
 
 
+class _Program:
+    """The program ``session_program``, which looks like a run that was launched."""
+
+    def __init__(self, file: Path, folder: Path, seconds: float, domain: int) -> None:
+        command = [sys.executable, "-m", "tests.conformance.session_program"]
+        self._log = file.with_name("program.log")
+        with self._log.open("w") as log:
+            self._process = subprocess.Popen(
+                [*command, str(file), str(folder), str(seconds)],
+                env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+                cwd=_ROOT,
+                stderr=log,
+            )
+
+    @property
+    def is_running(self) -> bool:
+        return self._process.poll() is None
+
+    def interrupt(self) -> None:
+        self._process.send_signal(signal.SIGINT)
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for its end. Raises ``TimeoutError``."""
+        try:
+            self._process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise TimeoutError from None
+
+    def kill(self) -> str:
+        """End it by force; returns where it stood."""
+        self._process.send_signal(signal.SIGABRT)
+        self._process.wait()
+        return self._log.read_text()
+
+
 def _wait(
-    live: LiveRun, project: Project, run_folder: Path, seconds: float, observed: Observed
+    live: LiveRun | _Program, project: Project, run_folder: Path, seconds: float, observed: Observed
 ) -> None:
     """Until it has ended, by itself or since it was interrupted some time after its first hook.
 
@@ -177,10 +237,12 @@ def _wait(
         observed.is_overdue = True
         observed.ending_ns = observed.ending_ns or time.monotonic_ns()
         live.interrupt()
+    if isinstance(live, _Program) and not _has_ended(live, LONGEST_S):
+        observed.error = f"it does not end:\n{live.kill()}"
     live.wait(LONGEST_S)
 
 
-def _has_ended(live: LiveRun, within_s: float) -> bool:
+def _has_ended(live: LiveRun | _Program, within_s: float) -> bool:
     with contextlib.suppress(TimeoutError):
         live.wait(within_s)
     return not live.is_running

@@ -106,7 +106,8 @@ def _judged(case: Case, meter: LoadMeter, seconds: float = 0.0) -> tuple[list[Vi
     observed = run(case.project, case.backend, meter, seconds=seconds)
     judge = Judge(case.project, observed)
     violations = list(judge.violations())
-    return violations, not violations and observed.exit_code != 1 and judge.is_dead
+    may_be_dead = observed.looks_for_deadlocks and observed.exit_code != 1
+    return violations, not violations and may_be_dead and judge.is_dead
 
 
 def verdicts(cases: Iterable[Case], jobs: int) -> Iterator[Verdict]:

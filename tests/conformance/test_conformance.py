@@ -1,6 +1,7 @@
 """A hundred random projects on the real back ends; thousands by ``python -m tests.conformance``.
 
-Most run in process and as processes, where a run takes a second or two; containers take longer.
+Most run in process, in a session and as processes, where a run takes a second or two; containers
+take longer.
 A fifth of them is run each time, the others before a release. What once broke a rule is in the
 folder ``kept`` and run first.
 """
@@ -15,10 +16,12 @@ from containers import require_containers
 
 from .description import Project
 from .projects import drawn
+from .running import LOCAL, WITHOUT_ROS
 from .search import Case, kept, verdicts
 
 SEED = 15
-RUNS = {"in-process": 54, "process": 42, "docker": 4}
+RUNS = {"in-process": 24, WITHOUT_ROS: 10, LOCAL: 20, "process": 42, "docker": 4}
+WITHOUT_CONTAINERS = [backend for backend in RUNS if backend != "docker"]
 EACH_TIME = slice(None, None, 5)
 JOBS = 2
 
@@ -44,13 +47,13 @@ def test_what_once_broke_a_rule_does_so_no_more():
     assert not broken(kept())
 
 
-@pytest.mark.parametrize("backend", ["in-process", "process"])
+@pytest.mark.parametrize("backend", WITHOUT_CONTAINERS)
 def test_random_projects_break_no_rule(backend: str):
     assert not broken(cases(backend)[EACH_TIME])
 
 
 @pytest.mark.acceptance
-@pytest.mark.parametrize("backend", ["in-process", "process"])
+@pytest.mark.parametrize("backend", WITHOUT_CONTAINERS)
 def test_further_random_projects_break_no_rule(backend: str):
     further = cases(backend)
     del further[EACH_TIME]

@@ -137,7 +137,9 @@ class NaiveNode:
             hook.is_in_last_round |= hook.place in last_round
             is_main_loop = hook.spec.outputs and all(port.is_optional for port in hook.inputs)
             hook.has_ended |= bool(is_main_loop) or hook.spec.period_s is not None
-        self.resume()
+        if self.paused_ns is not None:
+            self.end_pause()
+            self.one_pass()
 
     def pause(self) -> None:
         if self.is_draining:
@@ -150,9 +152,13 @@ class NaiveNode:
 
     def resume(self) -> None:
         if self.paused_ns is not None:
-            self.time_lost_ns += self.now_ns() - self.paused_ns
-            self.paused_ns = None
-            self.one_pass()
+            self.end_pause()
+            self.loop_back_if_startable()
+
+    def end_pause(self) -> None:
+        assert self.paused_ns is not None
+        self.time_lost_ns += self.now_ns() - self.paused_ns
+        self.paused_ns = None
 
     def step(self, count: int, *, is_driven: bool) -> None:
         if self.paused_ns is not None:
@@ -205,6 +211,9 @@ class NaiveNode:
                 if any(event[0] == "own packet" for event in self.events):
                     break
                 self.run(hook)
+        self.loop_back_if_startable()
+
+    def loop_back_if_startable(self) -> None:
         is_loop_back_waiting = any(event[0] == "loop-back" for event in self.events)
         startable = [h for h in self.hooks if self.is_allowed(h) and self.is_ready(h)]
         if startable and not is_loop_back_waiting:

@@ -232,8 +232,20 @@ def test_a_tick_that_was_due_when_the_pause_began_is_due_when_it_ends():
     bench.clock.advance(10.0)
     bench.acknowledge_to_node(OUT, 1)
     bench.engine.resume()
+    bench.settle()
     assert bench.ran == ["t", "t"]
     assert bench.hook("t").missed_ticks == 0
+
+
+def test_hooks_start_with_the_event_after_the_end_of_a_pause():
+    """One that started at once would hold the pause of the other nodes in the thread."""
+    bench = Bench(function("f", "x"), connections=[wire(IN, 0)])
+    bench.engine.pause()
+    bench.packet(IN)
+    bench.engine.resume()
+    assert bench.ran == []
+    bench.settle()
+    assert bench.ran == ["f"]
 
 
 def test_paused_time_has_an_account_of_its_own():

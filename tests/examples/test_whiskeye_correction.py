@@ -172,7 +172,7 @@ def picture(stamp: int, *, empty: bool = False) -> Image:
 
 
 @pytest.fixture
-def weights(load, tmp_path):
+def weights(load):
     """Of a network that has learnt next to nothing."""
     views = load("views")
     rng = np.random.default_rng(1)
@@ -180,22 +180,19 @@ def weights(load, tmp_path):
     seen = rng.normal(size=(24, views.PIXELS)).astype(np.float32)
     list(network.learn(seen, np.array([views.code_of(each) for each in range(24)]), 1))
     headings = rng.uniform(-3, 3, 24)
-    np.savez(
-        tmp_path / "weights.npz",
+    return {
         **network.weights,
-        rad_per_error=0.5,
-        old_views=seen.astype(np.float16),
-        old_rad=headings.astype(np.float32),
-        test_views=seen.astype(np.float16),
-        test_rad=headings.astype(np.float32),
-    )
-    return str(tmp_path / "weights.npz")
+        "rad_per_error": 0.5,
+        "old_views": seen.astype(np.float16),
+        "old_rad": headings.astype(np.float32),
+        "test_views": seen.astype(np.float16),
+        "test_rad": headings.astype(np.float32),
+    }
 
 
 def test_the_network_answers_each_pair_of_pictures_and_says_where_there_was_none(weights):
-    environment = {"WEIGHTS": weights}
     with PluginHarness.from_project(
-        EXAMPLE / "prediction.json", "pcn", environment=environment
+        EXAMPLE / "prediction.json", "pcn", restore={"weights": weights}
     ) as pcn:
         for stamp, empty in ((1, True), (2, False)):
             for eye in ("left_eye", "right_eye"):
@@ -217,9 +214,10 @@ def test_the_network_answers_each_pair_of_pictures_and_says_where_there_was_none
 
 def test_views_that_are_not_predicted_are_learnt_with_the_heading_of_the_ring(weights):
     """The heading of a view comes with the next pictures, as in the project."""
-    environment = {"WEIGHTS": weights, "GATE": "0", "NEW_VIEWS": "8", "EPOCHS": "12"}
+    environment = {"GATE": "0", "NEW_VIEWS": "8", "EPOCHS": "12"}
+    project, restore = EXAMPLE / "learning.json", {"weights": weights}
     with PluginHarness.from_project(
-        EXAMPLE / "learning.json", "pcn", environment=environment
+        project, "pcn", environment=environment, restore=restore
     ) as pcn:
         for stamp in range(1, 11):
             for eye in ("left_eye", "right_eye"):
@@ -230,7 +228,13 @@ def test_views_that_are_not_predicted_are_learnt_with_the_heading_of_the_ring(we
         pcn.run()
         before, *_, after = (each.vector.x for each in pcn.received("prediction_error"))
         (found,) = json.loads((pcn.run_dir / "learning.json").read_text())
+        kept = pcn.kept["weights"]
     assert found["learnt"] == 6
+    assert len(kept["old_rad"]) == len(kept["old_views"]) == len(weights["old_rad"]) + 6
+    assert not np.array_equal(kept["down0"], weights["down0"])
+    again = PluginHarness.from_project(project, "pcn", restore={"weights": kept})
+    again.run()
+    assert np.array_equal(again.kept["weights"]["down0"], kept["down0"])
     assert found["after"]["old"]["view_error"] < found["before"]["old"]["view_error"]
     assert found["after"] != found["before"]
     assert after != before
@@ -245,19 +249,10 @@ def test_pictures_of_two_eyes_are_paired_where_some_are_lost(load):
     assert eyes.pairs(left[4], right[5]) == [(left[4], right[4])]
 
 
-def test_weights_may_be_named_as_they_lie_beside_the_plugin(load, weights, monkeypatch):
-    pcn = load("pcn")
-    monkeypatch.setattr(pcn, "__file__", str(Path(weights).with_name("pcn.py")))
-    monkeypatch.setenv("WEIGHTS", "weights.npz")
-    assert "old_views" in pcn.Predictor().weights
-
-
-@pytest.mark.parametrize("named", ["", "/nowhere/weights.npz"])
-def test_without_weights_it_says_how_to_get_them(named):
+@pytest.mark.parametrize("project", ["prediction.json", "learning.json"])
+def test_without_weights_it_says_how_to_get_them(project):
     with (
-        PluginHarness.from_project(
-            EXAMPLE / "prediction.json", "pcn", environment={"WEIGHTS": named}
-        ) as pcn,
+        PluginHarness.from_project(EXAMPLE / project, "pcn") as pcn,
         pytest.raises(NodeError, match=r"train it with training\.json"),
     ):
         pcn.run()

@@ -31,7 +31,7 @@ ENDED_S = 120.0
 
 def network(files: Sequence[NodeFile]) -> test_transports.RosNetwork:
     """Nodes with a context each, as in processes of their own."""
-    return test_transports.RosNetwork([[file] for file in files], in_memory=False)
+    return test_transports.RosNetwork([[file] for file in files])
 
 
 def compressed(*arguments: Any, **options: Any) -> Connection:

@@ -99,7 +99,7 @@ def domain() -> Iterator[None]:
 
 
 def network(files: Sequence[NodeFile]) -> RosNetwork:
-    return RosNetwork([[file] for file in files], in_memory=False)
+    return RosNetwork([[file] for file in files])
 
 
 def segments() -> list[Path]:

@@ -8,13 +8,14 @@ from typing import Any
 
 import pytest
 from ros_program import RosProgram
-from transport_checks import TransportChecks
+from transport_checks import TOPIC, TransportChecks
 
 from neuros.backends.domain import choose_domain
-from neuros.ports import Transport
+from neuros.ports import Transport, TransportKind
 from neuros.project.model import NodeFile
+from neuros.runtime.local import LOCAL, MEMORY
 from neuros.transport.executors import EXECUTOR_VARIABLE
-from neuros.transport.ros_process import RosProcess
+from neuros.transport.ros_process import ROS
 
 SLICE_S = 0.002
 SETTLED_AFTER_S = 0.3
@@ -32,13 +33,15 @@ def domain() -> Iterator[None]:
 class RosNetwork:
     """Nodes in one or several ROS contexts of this process, which take turns."""
 
-    def __init__(self, groups: Sequence[Sequence[NodeFile]], *, in_memory: bool) -> None:
+    def __init__(self, groups: Sequence[Sequence[NodeFile]], kind: TransportKind = ROS) -> None:
         self._failures: list[BaseException] = []
         self._listeners: list[RosProgram] = []
         self._processes = []
         self._transports = {}
         for files in groups:
-            process = RosProcess(files, self._failures.append, in_memory=in_memory)
+            process = kind.middleware(
+                files, self._failures.append, digests=False, record=False, debug=False
+            )
             self._processes.append(process)
             for file in files:
                 self._transports[file.node.name] = process.transport(file)
@@ -78,14 +81,28 @@ class TestRosTransport(TransportChecks):
     """Each node in a context of its own, as in a process of its own."""
 
     def network(self, files: Sequence[NodeFile]) -> RosNetwork:
-        return RosNetwork([[file] for file in files], in_memory=False)
+        return RosNetwork([[file] for file in files])
 
 
 class TestMemoryTransportOnRos(TransportChecks):
     """All nodes in one context, packets handed over in memory."""
 
     def network(self, files: Sequence[NodeFile]) -> RosNetwork:
-        return RosNetwork([files], in_memory=True)
+        return RosNetwork([files], MEMORY)
+
+
+class UnseenNetwork(RosNetwork):
+    """Nodes whose connections have no topics on the ROS graph."""
+
+    def listen(self, topic: str, type_name: str) -> list[Any] | None:
+        return super().listen(topic, type_name) if topic == TOPIC else None
+
+
+class TestLocalTransport(TransportChecks):
+    """All nodes in one process, with ROS for their external topics alone."""
+
+    def network(self, files: Sequence[NodeFile]) -> RosNetwork:
+        return UnseenNetwork([files], LOCAL)
 
 
 class TestRosTransportOnAWaitSet(TestRosTransport):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +23,20 @@ SECONDS = 1
 TIMEOUT_S = 400.0
 
 
-def started(
-    variant: str, backend: str, cwd: Path, *flags: str, project: Path = WHISKEYE, **settings: object
-) -> Finished:
-    """Run a project to its end, without windows; ``node__NAME=value`` sets an environment value."""
+def started(variant: str, backend: str, cwd: Path, *flags: str, **settings: object) -> Finished:
+    """Run a project to its end, without windows; ``node__NAME=value`` sets an environment value.
+
+    ``pcn__weights`` is a file with the weights that it takes.
+    """
     arguments = [*flags]
     for name, value in settings.items():
         node, variable = name.split("__", 1)
+        if variable == "weights":
+            arguments += ["--restore", f"{node}.weights={value}"]
+            continue
         arguments += ["--set", f"nodes.{node}.environment.{variable}={value}"]
     options = {"cwd": cwd, "timeout_s": TIMEOUT_S, "NEUROS_GUI": "0"}
-    run = launch(project / f"{variant}.json", "--backend", backend, *arguments, **options)
+    run = launch(WHISKEYE / f"{variant}.json", "--backend", backend, *arguments, **options)
     assert run.exit_code == 0, run.output
     return run
 
@@ -95,7 +98,7 @@ def test_prediction_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path)
     tables = []
     for backend in BACKENDS:
         (tmp_path / backend).mkdir()
-        settings = {"robot__DURATION": SECONDS, "snn__GATE": 9, "pcn__WEIGHTS": weights}
+        settings = {"robot__DURATION": SECONDS, "snn__GATE": 9, "pcn__weights": weights}
         run = started("prediction", backend, tmp_path / backend, **settings)
         for each in run.record["connections"]:
             assert each["sent"] == each["consumed"] > 0, each
@@ -110,16 +113,13 @@ def test_prediction_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path)
 @pytest.mark.acceptance
 def test_five_runs_and_all_back_ends_carry_the_same_packets(weights, tmp_path, capsys):
     require_containers(*IMAGES)
-    # In containers the nodes see the folder of their project alone.
-    project = Path(shutil.copytree(WHISKEYE, tmp_path / "whiskeye"))
-    shutil.copy(weights, project)
-    settings = {"robot__DURATION": 2, "snn__GATE": 9, "pcn__WEIGHTS": weights.name}
+    settings = {"robot__DURATION": 2, "snn__GATE": 9, "pcn__weights": weights}
     runs = []
     with nothing_left(tmp_path):
         for number, backend in enumerate(("process",) * 5 + ("in-process", "docker")):
             cwd = tmp_path / str(number)
             cwd.mkdir()
-            run = started("prediction", backend, cwd, "--digests", project=project, **settings)
+            run = started("prediction", backend, cwd, "--digests", **settings)
             runs.append(run.run_folder)
     first, *others = runs
     for other in others:
@@ -131,7 +131,7 @@ def test_five_runs_and_all_back_ends_carry_the_same_packets(weights, tmp_path, c
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_the_hybrid_loses_no_imu_packet(weights, tmp_path, backend):
     run = started(
-        "prediction_hybrid", backend, tmp_path, robot__DURATION=SECONDS, pcn__WEIGHTS=weights
+        "prediction_hybrid", backend, tmp_path, robot__DURATION=SECONDS, pcn__weights=weights
     )
     assert run.connection("robot.imu -> snn.imu")["consumed"] == 50 * SECONDS
     assert run.connection("pcn.odom_correction -> snn.odom_correction")["sent"] > 0
@@ -141,7 +141,7 @@ def test_the_hybrid_loses_no_imu_packet(weights, tmp_path, backend):
 def test_the_asynchronous_variant_ends_properly(weights, tmp_path):
     # Slowly: until the rings have settled, packets pass by.
     slowly = {"robot__DURATION": 2 * SECONDS, "robot__REAL_TIME_FACTOR": 0.2}
-    settings = {**slowly, "pcn__WEIGHTS": weights}
+    settings = {**slowly, "pcn__weights": weights}
     run = started("prediction_asynchronous", BACKENDS[0], tmp_path, **settings)
     assert run.connection("robot.imu -> snn.imu")["consumed"] > 0
     assert (run.run_folder / "visualiser/correction.json").exists()
@@ -151,7 +151,7 @@ def test_learning_is_the_same_bit_for_bit_on_every_back_end(weights, tmp_path):
     found = []
     for backend in BACKENDS:
         (tmp_path / backend).mkdir()
-        settings = {"robot__DURATION": SECONDS, "pcn__WEIGHTS": weights}
+        settings = {"robot__DURATION": SECONDS, "pcn__weights": weights}
         settings |= {"pcn__GATE": 0, "pcn__NEW_VIEWS": 8, "pcn__EPOCHS": 2, "snn__GATE": 9}
         run = started("learning", backend, tmp_path / backend, **settings)
         learnt = json.loads((run.run_folder / "snn/results.json").read_text())

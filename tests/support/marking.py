@@ -40,6 +40,8 @@ BY_NAME = {
     "ros": (
         "api/test_arrays_in_programs.py::test_a_session",
         "api/test_copies.py",
+        "api/test_free_runs.py",
+        "api/test_kept_values.py",
         "api/test_local_sessions.py",
         "api/test_python_api.py",
         "api/test_reset_settings.py",
@@ -63,6 +65,8 @@ BY_NAME = {
         "extensions/neuros-learn/tests/test_gym_pictures.py",
         "extensions/neuros-learn/tests/test_gym_vectors.py",
         "integration/",
+        "runtime/test_local_loop.py::test_a_free_run_serves_ros",
+        "runtime/test_local_loop.py::test_events_timers_and_threads",
         "upgrades/test_upgrades.py",
     ),
     "process": (

@@ -75,6 +75,31 @@ def test_the_example_in_its_docstring_works(tmp_path, monkeypatch):
     assert result.failed == 0
 
 
+KEEPER = COUNT.replace(
+    "START)\n", "START)\n        node.keep('sum', node.get_user_data, node.set_user_data)\n", 1
+)
+
+
+def test_a_plugin_gets_back_what_it_keeps_and_the_test_sees_it(plugin):
+    arguments = {"inputs": {"x": INT}, "outputs": {"total": INT}}
+    with PluginHarness(plugin(KEEPER), **arguments, restore={"sum": 40}) as harness:
+        harness.send("x", *integers(1, 1))
+        assert harness.kept == {}
+        harness.run()
+        assert numbers(harness.received("total")) == [41, 42]
+        assert harness.kept == {"sum": 42}
+    assert (harness.run_dir / "kept" / "sum.npz").exists()
+
+
+def test_a_test_that_restores_what_nothing_keeps_fails(plugin):
+    with pytest.raises(NodeError, match=r"nothing in node 'node' keeps 'sun' .did you mean 'sum'"):
+        PluginHarness(
+            plugin(KEEPER), inputs={"x": INT}, outputs={"total": INT}, restore={"sun": 1}
+        ).run()
+    with pytest.raises(NodeError, match="keep: 'sum' is a set, which cannot be kept"):
+        counter(plugin, restore={"sum": {1}})
+
+
 def test_the_example_of_wire_works():
     (example,) = doctest.DocTestFinder().find(wire, "wire", globs={"wire": wire})
     assert doctest.DocTestRunner(verbose=False).run(example).failed == 0

@@ -30,7 +30,7 @@ class MemoryNetwork:
         return True
 
     def settle(self) -> None:
-        self.loop.run()
+        self.loop.run_until_idle()
 
     def listen(self, topic: str, type_name: str) -> list[Any] | None:
         return None

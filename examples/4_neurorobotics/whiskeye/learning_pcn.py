@@ -4,7 +4,8 @@ A view whose prediction error is above ``GATE`` is kept, with the heading that t
 its stamp: nobody else knows it. When there are ``NEW_VIEWS`` of them, the network learns them, and
 again the old views that ``weights.npz`` has kept of its training, so that it does not forget.
 Every fourth of the new views it does not learn but is tested with, as with the old test views.
-The errors before and after are results, and ``learning.json`` in the node's folder of the run.
+The errors before and after are results, and ``learning.json`` in the node's folder of the run. What
+it knows at the end is kept: another run goes on from there.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ import json
 import os
 
 import numpy as np
-from pcn import Predictor
+from pcn import HOW, Predictor
 from views import code_of, heading_of, view_of
 
+from neuros.errors import NodeError
 from neuros.hooks import Optional, neuros_function, neuros_initialise
 from neuros.time import to_nanoseconds
 
@@ -27,12 +29,21 @@ class Learner:
     """Gathers what is new, and learns it beside what is old."""
 
     def __init__(self):
-        self.predictor = Predictor()
-        self._old = [self.predictor.weights[name] for name in ("old_views", "old_rad")]
-        self._tested = [self.predictor.weights[name] for name in ("test_views", "test_rad")]
+        self.predictor = None
         self._waiting = None  # (stamp in ns, view) of a view whose heading is not known yet
         self._new = []  # (view, heading in rad)
         self.rounds = []
+
+    def go_on(self, weights):
+        """Go on from what has been learnt."""
+        self.predictor = Predictor(weights)
+        self._old = [weights[name] for name in ("old_views", "old_rad")]
+        self._tested = [weights[name] for name in ("test_views", "test_rad")]
+
+    def weights(self):
+        """What has been learnt, and what is learnt again beside the next new views."""
+        old = dict(zip(("old_views", "old_rad"), self._old, strict=True))
+        return {**self.predictor.weights, **self.predictor.network.weights, **old}
 
     def keep(self, stamp, view):
         self._waiting = stamp, view
@@ -76,7 +87,11 @@ class Learner:
 
 @neuros_initialise()
 def start(node):
-    node.set_user_data(Learner())
+    learner = Learner()
+    node.set_user_data(learner)
+    node.keep("weights", learner.weights, learner.go_on)
+    if learner.predictor is None:
+        raise NodeError(HOW)
 
 
 @neuros_function(

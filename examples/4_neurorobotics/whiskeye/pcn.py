@@ -12,11 +12,8 @@ without pixels the heading is NaN, and there is nothing else: nothing was seen.
 from __future__ import annotations
 
 import math
-import os
 from array import array
-from pathlib import Path
 
-import numpy as np
 from predictive_coding import PredictiveCodingNetwork
 from views import heading_of, picture_of, view_of
 
@@ -25,8 +22,8 @@ from neuros.hooks import Optional, neuros_function, neuros_initialise
 from neuros.time import to_nanoseconds
 
 HOW = (
-    "train it with training.json, and name its file: "
-    "--set nodes.pcn.environment.WEIGHTS=<run folder>/trainer/weights.npz"
+    "it has no weights: train it with training.json, and give it what that has learnt: "
+    "--restore pcn.weights=<run folder>/trainer/weights.npz"
 )
 
 
@@ -52,22 +49,16 @@ class Eyes:
 
 
 class Predictor:
-    """The network of ``WEIGHTS``, and how far a heading is off per prediction error of its view.
+    """The network of a training run, and how far a heading is off per prediction error of its view.
 
-    A relative path may lead from the folder of this file, which is all that a container sees.
+    Attributes:
+        weights: what ``trainer.py`` has written.
     """
 
-    def __init__(self):
-        named = os.environ.get("WEIGHTS", "")
-        try:
-            beside = Path(__file__).parent / named
-            with np.load(beside if beside.is_file() else Path(named)) as weights:
-                self.weights = dict(weights)
-            self.network = PredictiveCodingNetwork.of_weights(self.weights)
-            self._rad_per_error = float(self.weights["rad_per_error"])
-        except (OSError, ValueError, KeyError) as error:
-            what = f"'{named}' cannot be read ({error})" if named else "is not set"
-            raise NodeError(f"WEIGHTS {what}: {HOW}") from error
+    def __init__(self, weights):
+        self.weights = weights
+        self.network = PredictiveCodingNetwork.of_weights(weights)
+        self._rad_per_error = float(weights["rad_per_error"])
 
     def packets(self, node, left, right):
         """All outputs for a pair of pictures; of one without pixels ``odom_correction`` alone."""
@@ -92,7 +83,15 @@ class Predictor:
 
 @neuros_initialise()
 def start(node):
-    node.set_user_data((Predictor(), Eyes()))
+    own = {"eyes": Eyes()}
+    node.set_user_data(own)
+    node.keep(
+        "weights",
+        lambda: own["predictor"].weights,
+        lambda weights: own.update(predictor=Predictor(weights)),
+    )
+    if "predictor" not in own:
+        raise NodeError(HOW)
 
 
 @neuros_function(
@@ -100,6 +99,6 @@ def start(node):
     outputs=[Optional(name) for name in ("odom_correction", "prediction_error", "predicted_view")],
 )
 def look(node, left, right):
-    predictor, eyes = node.get_user_data()
-    pairs = eyes.pairs(left, right)
-    return predictor.packets(node, *pairs[-1]) if pairs else None
+    own = node.get_user_data()
+    pairs = own["eyes"].pairs(left, right)
+    return own["predictor"].packets(node, *pairs[-1]) if pairs else None

@@ -263,7 +263,11 @@ class Agent:
             path.touch(0o600)  # the files hold keys
             path.write_text(text, "utf-8")
         machine = order.machine
-        self._follower = Follower(self._run, names, machine, given.keys())
+        for name, data in order.restored.items():
+            path = self._run / name
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(data)
+        self._follower = Follower(self._run, names, machine, {*given, *order.restored})
         listener = UnixListener(self._run)
         # The first digits are those of the launcher's run; to reapers it is another run.
         run_id = order.run[:8] + os.urandom(4).hex()

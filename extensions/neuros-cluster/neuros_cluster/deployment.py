@@ -11,7 +11,7 @@ import json
 import re
 import socket
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from neuros.backends.node_command import moved
 from neuros.control import CONTROL_VARIABLE
 from neuros.distribution import WORKSPACE
 from neuros.errors import EnvironmentFault, results_of
+from neuros.node.keeping import RESTORED, SUFFIX
 from neuros.ports import (
     Deployment,
     DeploymentKind,
@@ -290,6 +291,7 @@ class _Launcher:
                 tuple(self._program.options),
                 {name: c for name, c in self._program.cores.items() if name in side.nodes},
                 self._machines.monitors_load,
+                dict(_restored(run, files)),
             ),
             run,
             lambda: connect(environment[CONTROL_VARIABLE]),
@@ -360,6 +362,13 @@ def _texts(run: Path) -> dict[str, str]:
                 f"{path} cannot be read, and other machines need it: {why}"
             ) from error
     return found
+
+
+def _restored(run: Path, files: Iterable[NodeFile]) -> Iterator[tuple[str, bytes]]:
+    for file in files:
+        for name in file.restored:
+            path = Path(file.node.name, RESTORED, f"{name}{SUFFIX}")
+            yield path.as_posix(), (run / path).read_bytes()
 
 
 def _package(python: Path) -> str:

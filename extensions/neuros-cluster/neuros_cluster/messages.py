@@ -104,6 +104,7 @@ class Start(Message):
         options: of the node program.
         cores: by node.
         monitors_load: whether to record the system load.
+        restored: contents of files of kept values for the folders of nodes, by name.
     """
 
     run: str
@@ -115,6 +116,7 @@ class Start(Message):
     options: tuple[str, ...]
     cores: Mapping[str, tuple[int, ...]]
     monitors_load: bool = False
+    restored: Mapping[str, bytes] = {}
 
 
 class KillNode(Message):

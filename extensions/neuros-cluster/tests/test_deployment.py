@@ -23,6 +23,7 @@ from neuros_cluster.files import scan
 from neuros_cluster.machine import Machine, agent_command
 from neuros_cluster.messages import Lacking, ThreadsRead
 
+import neuros
 from containers import wait_until
 from neuros.control.link import encode
 from neuros.errors import EnvironmentFault
@@ -125,6 +126,23 @@ def test_one_command_starts_nodes_elsewhere_and_brings_home_all_they_leave(
     assert finished.connection(CONNECTION)["latency_ms"]["p50"] > 0
     assert left_there(tmp_path) == []
     assert len(trees_there(tmp_path)) == 1
+
+
+def test_a_node_elsewhere_goes_on_learning(project: Path, tmp_path: Path) -> None:
+    sink = project / "sink.py"
+    keeps = "    node.keep('seen', lambda: len(numbers), lambda n: numbers.extend([0] * n))\n"
+    begins = f"\n@neuros_initialise()\ndef begin(node):\n{keeps}"
+    imports = "from neuros.hooks import neuros_finalise, neuros_function"
+    sink.write_text(sink.read_text().replace(imports, f"{imports}, neuros_initialise") + begins)
+    runs: list[Finished] = []
+    for more in ([], ["--restore", f"sink.seen={tmp_path / 'first'}"]):
+        folder = ["-o", "second" if runs else "first"]
+        with deployed(project, *folder, *more, cwd=tmp_path) as running:
+            runs.append(running.finish(ENDED_S))
+        assert runs[-1].exit_code == 0, runs[-1].output
+    first, second = (finished.record["nodes"]["sink"] for finished in runs)
+    assert second["restored"]["seen"]["sha256"] == first["kept"]["seen"]["sha256"]
+    assert neuros.Run(tmp_path / "second").kept("sink.seen") == 200
 
 
 def test_it_is_said_where_a_node_elsewhere_stood_that_is_killed(tmp_path: Path) -> None:

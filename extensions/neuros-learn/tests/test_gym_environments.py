@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import nbclient
+import nbformat
 import numpy as np
 import pytest
 from cart_project import cart
@@ -536,6 +538,18 @@ def test_stable_baselines3_trains_it_in_two_minutes_and_the_node_acts_as_its_mod
         force = policy.push(layers, seen[:2], seen[2:])
         assert force == pytest.approx(model.predict(seen, deterministic=True)[0][0], abs=1e-5)
     assert min(_upright_s(made, tmp_path, seeds=(1, 2, 3))) > 9.9
+
+
+@pytest.mark.acceptance
+def test_the_notebook_learns_it_and_runs_what_it_has_learnt_as_a_node(tmp_path: Path) -> None:
+    pytest.importorskip("stable_baselines3", reason="pip install torch stable-baselines3")
+    made = shutil.copytree(EXAMPLE, tmp_path / "cartpole")
+    (made / "network.npz").unlink()
+    notebook = nbformat.read(made / "learn.ipynb", as_version=4)
+    client = nbclient.NotebookClient(notebook, timeout=600, resources={"metadata": {"path": made}})
+    client.execute()
+    *_, upright = notebook.cells[-1].outputs
+    assert float(upright["data"]["text/plain"]) > 9.9
 
 
 def _upright_s(example: Path, folder: Path, seeds: Sequence[int]) -> list[float]:
