@@ -41,7 +41,7 @@ def test_a_run_calls_the_functions_that_the_page_lists_in_that_order(tmp_path: P
     (tmp_path / "traces").mkdir()
     run = launch(
         EXAMPLES / "1_tick/clock",
-        *("--backend", "process", "--duration", "1"),
+        *("--backend", "process", "--duration", "3"),  # the clock ticks once per second
         cwd=tmp_path,
         timeout_s=60.0,
         PYTHONPATH=str(tmp_path / "site"),
