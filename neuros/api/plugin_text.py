@@ -210,7 +210,7 @@ def write_project(
         project: the same, loaded with ``overrides``.
 
     Raises:
-        UsageError: as :meth:`neuros.Project.to_json`.
+        UsageError: as ``neuros.Project.to_json``.
     """
     parsed = source.parsed(Roots(source.folder, WORKSPACE))
     for text in overrides:

@@ -122,8 +122,8 @@ class Project:
         settings: by path, values that replace those in the files.
 
     Args:
-        nodes: of the project, :class:`neuros.Node`.
-        connections: between them: ``a["x"] >> b["y"]``, or :class:`neuros.Connection`.
+        nodes: of the project, ``neuros.Node``.
+        connections: between them: ``a["x"] >> b["y"]``, or ``neuros.Connection``.
         folder: from which paths in the project begin; ``None``: the current folder.
         keys: the other keys of a project file: ``description``, ``budgets``, ``namespace``, ....
 
