@@ -166,8 +166,10 @@ def install() -> None:
     def noting_hooks(plugin: Path, name: str, *rest: Any) -> Sequence[HookSpec]:
         return cycles.add(name, load(plugin, name, *rest))
 
-    def noting_context(self: ContextSwitch, environment: Mapping[str, str], *rest: Any) -> Context:
-        context = make_context(self, environment, *rest)
+    def noting_context(
+        self: ContextSwitch, environment: Mapping[str, str], *rest: Any, **named: Any
+    ) -> Context:
+        context = make_context(self, environment, *rest, **named)
         name = Path(environment["NEUROS_RUN_DIR"]).name
         cycles.add_context(name, partial(self.enter, context))
         return context
