@@ -668,6 +668,20 @@ class LaunchExtension(ABC):
         """
 
 
+@dataclass(frozen=True)
+class RobotChoices:
+    """What the file of a robot does not say.
+
+    Attributes:
+        base: ``free`` or ``fixed``; ``None``: the file says it, or the user is asked.
+        drive: ``position``, ``velocity``, ``motor`` or ``none`` for every joint; ``None``: position
+            for joints with limits, velocity for others.
+    """
+
+    base: str | None = None
+    drive: str | None = None
+
+
 class ModelFormat(ABC):
     """A format of models besides MuJoCo's own, an entry point of the group ``neuros.models``.
 
@@ -692,6 +706,18 @@ class ModelFormat(ABC):
 
         Raises:
             DescriptionError: with all problems of the file.
+        """
+
+    @abstractmethod
+    def make_project(
+        self, file: Path, folder: Path, environ: Mapping[str, str], choices: RobotChoices
+    ) -> Sequence[str]:
+        """Write a project around the robot of a file into a folder; what is in it, in lines.
+
+        Raises:
+            DescriptionError: with all problems of the file.
+            UsageError: something is neither in the file nor chosen.
+            OSError: the folder cannot be written.
         """
 
 

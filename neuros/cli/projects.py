@@ -8,6 +8,7 @@ import os
 import re
 import shutil
 import sys
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -23,7 +24,9 @@ from neuros.cli.common import (
 )
 from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import NeurosError, ProjectError, UsageError
+from neuros.ports import RobotChoices
 from neuros.project.suggest import counted, did_you_mean
+from neuros.registry import MODELS
 
 EXIT_NODE = 1
 EXIT_PROJECT = 3
@@ -178,15 +181,62 @@ _IN_GALLERY = re.compile(r"^## \[.*\]\((.*)/README\.md\)\n\n([^.]*\.(?=\s))", re
 def add_new(new: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     new.description = (
-        "Make a folder with a small project that runs: two plugins in a closed loop, and a test."
+        "Make a folder with a small project that runs: two plugins in a closed loop, and a test;"
+        " or a robot of yours in MuJoCo, with drives and sensors, and a brain that moves it."
     )
-    new.add_argument("folder", type=Path, metavar="FOLDER", help="a new or empty folder")
+    new.add_argument(
+        "folder",
+        nargs="?",
+        type=Path,
+        metavar="FOLDER",
+        help="a new or empty folder (default with --robot: the name of its file)",
+    )
+    new.add_argument("--robot", type=Path, metavar="FILE", help="a robot in URDF or SDF")
+    new.add_argument(
+        "--base",
+        choices=["free", "fixed"],
+        help="whether the robot moves (wheels, legs), or is held (an arm), where its file does not"
+        " say so; asked for on a terminal",
+    )
+    new.add_argument(
+        "--drive",
+        choices=["position", "velocity", "motor", "none"],
+        help="the drive of every joint (default: position; velocity for joints without limits)",
+    )
     new.set_defaults(command=_new)
 
 
 def _new(options: argparse.Namespace) -> int:
+    if options.robot is not None:
+        return _new_robot(options.robot, options.folder, options.base, options.drive)
+    if options.folder is None:
+        raise UsageError("name a folder for the project, or a robot with --robot FILE")
+    if options.base or options.drive:
+        raise UsageError("--base and --drive belong to --robot FILE")
     _copy(_TEMPLATE, options.folder, {})
     print(f"made {options.folder}; the next command: neuros launch {options.folder}")
+    return 0
+
+
+def _new_robot(robot: Path, folder: Path | None, base: str | None, drive: str | None) -> int:
+    if not robot.is_file():
+        raise UsageError(f"--robot {robot}: there is no such file")
+    made = folder or Path(robot.name.partition(".")[0])
+    _require_empty(made)
+    format_ = MODELS.load(robot.suffix.lower()[1:])
+    # First into a folder beside: after an error there is none.
+    try:
+        made.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".new-", dir=made.parent) as draft:
+            inside = Path(draft) / made.name
+            inside.mkdir()
+            rows = format_.make_project(robot, inside, os.environ, RobotChoices(base, drive))
+            shutil.copytree(inside, made, dirs_exist_ok=True)
+    except OSError as error:
+        reason = error.strerror or error
+        raise UsageError(f"{made} cannot be made ({reason}): name another folder") from error
+    print("\n".join(rows))
+    print(f"made {made}; the next command: neuros launch {made} --dashboard")
     return 0
 
 
@@ -237,15 +287,24 @@ def _example(options: argparse.Namespace) -> int:
     return 0
 
 
+def _require_empty(folder: Path) -> None:
+    """Raise ``UsageError`` if there is something in a folder already."""
+    try:
+        if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
+            raise UsageError(f"{folder} exists already: name another folder")
+    except OSError as error:
+        reason = error.strerror or error
+        raise UsageError(f"{folder} cannot be made ({reason}): name another folder") from error
+
+
 def _copy(source: Path, folder: Path, renamed: Mapping[str, str]) -> None:
     """Copy a project folder; ``renamed`` holds for its pages and Python files.
 
     Raises:
         UsageError: if there is something in the folder already, or it cannot be written.
     """
+    _require_empty(folder)
     try:
-        if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
-            raise UsageError(f"{folder} exists already: name another folder")
         skipped = shutil.ignore_patterns("__pycache__", "runs")
         shutil.copytree(
             source, folder, ignore=skipped, copy_function=shutil.copyfile, dirs_exist_ok=True

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuros.errors import DescriptionError, EnvironmentFault, Problem, UsageError
+from neuros.errors import EnvironmentFault, UsageError
 
 if TYPE_CHECKING:
     from neuros_robots.mjcf import Converted
@@ -58,11 +58,6 @@ def _convert(options: argparse.Namespace) -> int:
         files = write_mjcf(converted, source, output)
     except OSError as error:
         raise EnvironmentFault(f"{output}: cannot be written: {error.strerror}") from error
-    except ValueError as error:
-        text = " ".join(str(error).split())
-        text = f"MuJoCo cannot read its own output: {text}"
-        problem = Problem(str(source), 1, 1, "/", text)
-        raise DescriptionError([problem]) from error
     if converted.differences:
         from tabulate import tabulate
 

@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from neuros.ports import ModelFormat
+from neuros.ports import ModelFormat, RobotChoices
 from neuros_robots.elements import Finder, NotFound, finder
 from neuros_robots.mjcf import Converted
+from neuros_robots.project import make_project
 from neuros_robots.sdf import convert_sdf
 from neuros_robots.urdf import read_urdf
 
@@ -29,6 +30,12 @@ class _Description(ModelFormat):
     def read(self, file: Path, environ: Mapping[str, str]) -> tuple[Any, Sequence[str]]:
         converted = self._convert(file, finder((), environ))
         return converted.spec, [str(note) for note in converted.differences]
+
+    def make_project(
+        self, file: Path, folder: Path, environ: Mapping[str, str], choices: RobotChoices
+    ) -> Sequence[str]:
+        converted = self._convert(file, finder((), environ))
+        return make_project(converted, file, folder, choices)
 
 
 URDF = _Description("urdf", read_urdf)

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 import numpy.typing as npt
 
+from neuros.errors import DescriptionError, Problem
 from neuros_robots.elements import Difference, Element, Finder, NotFound
 from neuros_robots.frames import Link, Pose, Vector, from_quaternion
 
@@ -31,6 +32,7 @@ _SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 _HOW = "`pip install 'neuros[meshes]'` converts it"
 Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
 """Vertices, shape (n, 3), metres, and the numbers of the corners of faces, shape (m, 3)."""
+_ROUNDED = 2e-5  # twice what rounding adds to the largest moment of inertia
 _FLAT = 1e-4  # largest ratio of thickness to length of a flat mesh
 _THICKNESS_M = 0.01
 _RECTANGULAR = 0.999  # smallest share of a rectangle that a rectangular mesh fills
@@ -150,9 +152,12 @@ def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
     Meshes are named relative to the file. A draft is compiled from the disk before it gets its
     name, so that an existing file works.
 
-    Raises ``OSError``, and ``ValueError`` if MuJoCo cannot read the draft.
+    Raises ``OSError``, and ``DescriptionError`` if MuJoCo cannot read the draft.
     """
     spec = converted.spec.copy()
+    for body in spec.bodies:
+        if body.explicitinertial:
+            _make_roundable(body)
     spec.modelfiledir = str(output.resolve().parent)
     folder = Path(spec.modelfiledir)
     folder.mkdir(parents=True, exist_ok=True)
@@ -181,9 +186,22 @@ def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
         draft.write_text(f"<!-- {comment}\n-->\n{spec.to_xml()}", "utf-8")
         mujoco.MjSpec.from_file(str(draft)).compile()
         draft.replace(output)
+    except ValueError as error:
+        text = f"MuJoCo cannot read its own output: {message_of(error)}"
+        raise DescriptionError([Problem(str(source), 1, 1, "/", text)]) from error
     finally:
         draft.unlink(missing_ok=True)
     return [output, *written]
+
+
+def _make_roundable(body: Any) -> None:
+    """Let the inertia of a flat body stay possible when it is rounded to six digits."""
+    order = np.argsort(body.inertia)
+    moments = np.array(body.inertia)
+    lack = moments[order[2]] * (1 + _ROUNDED) - moments[order[:2]].sum()
+    if lack > 0:
+        moments[order[:2]] += lack / 2
+        body.inertia = moments
 
 
 def is_ours(file: Path) -> bool:

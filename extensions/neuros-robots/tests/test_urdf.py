@@ -262,6 +262,15 @@ def test_an_inertia_that_no_body_has_is_repaired_and_listed(
     assert [*notes] == ["3 link[b]/inertial/inertia"]
 
 
+def test_the_inertia_of_a_flat_body_survives_the_digits_of_a_written_file(folder: Folder) -> None:
+    x, y = 0.0123456789, 0.0456789123
+    moments = f'ixx="{x}" iyy="{y}" izz="{x + y}"'
+    _, notes = read(folder, two("continuous").replace('ixx="1" iyy="1" izz="1"', moments))
+    assert not notes
+    again = mujoco.MjModel.from_xml_path(str(written(folder)))
+    assert sorted(again.body("b").inertia) == pytest.approx([x, y, x + y], rel=1e-4)
+
+
 def test_a_negative_moment_is_a_mistake(folder: Folder) -> None:
     (problem,) = problems(folder, two("continuous").replace('ixx="1"', 'ixx="-1"', 1))
     assert "no body has this inertia: its principal moments are -1, 1 and 1 kg m²" in problem
