@@ -220,6 +220,9 @@ class Engine:
 
         A second pause revokes the steps that are left. A pause of a draining node has no effect.
         """
+        if self._cause is PAUSED:
+            self._pause.revoke()
+            return
         now_ns = self._wake()
         if not self._lifecycle.is_draining:
             self._pause.begin(now_ns)

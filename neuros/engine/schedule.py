@@ -285,10 +285,14 @@ class Pause:
         self.is_on = False
 
     def begin(self, now_ns: int) -> None:
-        """Pause; a second pause revokes the steps that are left."""
+        """Pause, if it is not paused already; the steps that are left are revoked."""
         if not self.is_on:
             self.is_on, self._since_ns = True, now_ns
             self._still_since_ns = now_ns
+        self.revoke()
+
+    def revoke(self) -> None:
+        """Revoke the steps that are left."""
         self._granted = 0
         self._started.clear()
 
@@ -350,7 +354,8 @@ class Pause:
 
     def record_start(self, hook: Hook, now_ns: int, arrivals: int) -> None:
         """Count the start of a hook in the pause; ``arrivals`` as of :meth:`grant`."""
-        self._end_standstill(now_ns)
+        if self._still_since_ns is not None:
+            self._end_standstill(now_ns)
         started = self._started[hook] = self._started.get(hook, 0) + 1
         if hook.drives:
             self._arrived = arrivals
