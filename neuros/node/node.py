@@ -19,7 +19,7 @@ from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
 from neuros.errors import ControlError, HookError, NeurosError, ProtocolError
 from neuros.hooks import HookKind, HookSpec, hook_specs_of
-from neuros.node.context import ContextSwitch
+from neuros.node.context import Context, ContextSwitch
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices, Results
 from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Tap
@@ -157,7 +157,8 @@ class NodeRuntime:
             self.failures,
             self._time,
             instruments,
-            enter=self._enter,
+            contexts=contexts,
+            context=self._context,
             on_ready=self._note_ready,
             on_initialised=self._note_initialised,
         )
@@ -183,7 +184,7 @@ class NodeRuntime:
     @property
     def has_context(self) -> bool:
         """Whether the context of this node is in place now."""
-        return self._contexts.has(self._context)
+        return self._contexts.current is self._context
 
     @property
     def sim_time(self) -> float | None:
@@ -310,7 +311,12 @@ class NodeRuntime:
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let the hooks that drive the project start so many times more."""
-        self._guard(lambda: self._loaded.step(count, is_driven=is_driven))
+        engine = self.engine
+        assert engine is not None
+        try:
+            engine.step(count, is_driven=is_driven)
+        except NeurosError as error:
+            self.failures.report(error)
 
     def stop(self) -> None:
         """Start no further hook. Any thread."""
@@ -350,7 +356,7 @@ class NodeRuntime:
         """A packet has arrived on an external topic."""
         for observe in self._heard[port.name].observers:
             observe(packet, None)
-        self._guard(lambda: self._loaded.on_packet(port.name, packet))
+        self._guard(partial(self._loaded.on_packet, port.name, packet))
 
     def deliver(self, input_name: str, data: bytes) -> None:
         """An observer sends a packet to an input of the session.
@@ -483,7 +489,7 @@ class NodeEffects:
     """The :class:`~neuros.engine.engine.Effects` of one running node.
 
     Args:
-        enter: puts the context of the node in place.
+        contexts, context: the context of the node, and what puts it in place.
         instruments: what looks at packets, in this order.
         on_ready: called once the node waits for all others to become ready.
         on_initialised: called after each initialise hook.
@@ -500,7 +506,8 @@ class NodeEffects:
         time: SimulatedTime,
         instruments: Sequence[Instrument],
         *,
-        enter: Callable[[], None],
+        contexts: ContextSwitch,
+        context: Context,
         on_ready: Callable[[], object],
         on_initialised: Callable[[], None],
     ) -> None:
@@ -518,7 +525,7 @@ class NodeEffects:
         self._instruments = instruments
         self._sent: dict[str, Tap] = {}
         self._taps_to_itself: dict[Connection, Tap] = {}
-        self._enter = enter
+        self._contexts, self._context = contexts, context
         self.note_ready = on_ready
         self._on_initialised = on_initialised
 
@@ -535,7 +542,8 @@ class NodeEffects:
         Raises:
             HookError: if it raises any exception.
         """
-        self._enter()
+        if self._contexts.current is not self._context:
+            self._contexts.enter(self._context)
         spec = hook.spec
         try:
             result = spec.function(self._handle, *arguments)
