@@ -222,7 +222,7 @@ class LocalRun:
                 except NeurosError as error:
                     self._fail(node.name, error)
                     break
-                self._declarations.take(declared(node.name, node.specs))
+                self._declarations.add(declared(node.name, node.specs))
                 self._loop.post(partial(node.start, awaits_others=not self._is_active))
             self._come_to_rest()
         return True
@@ -306,7 +306,7 @@ class LocalRun:
             is_local=True,
         )
         node.load()
-        self._declarations.take(declared(node.name, node.specs))
+        self._declarations.add(declared(node.name, node.specs))
 
     def _activate(self) -> None:
         """Every node is ready: this is time 0 of the run."""
@@ -349,7 +349,7 @@ class LocalRun:
             self._next_report_s = now_s + _REPORT_S
             for node in self._nodes.values():
                 node.reports.write_logs()
-                self._outcome.take(node.reports.report(), now_s)
+                self._outcome.add(node.reports.report(), now_s)
         packets = {}
         for name, number in known.items():
             node_name, _, output = name.partition(".")
@@ -448,7 +448,7 @@ class LocalRun:
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
                     node.reports.write_logs()
-                    outcome.take(node.reports.report(is_final=True), time.monotonic())
+                    outcome.add(node.reports.report(is_final=True), time.monotonic())
         finally:
             self._middleware.close()
             self._contexts.close()

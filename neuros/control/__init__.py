@@ -231,7 +231,7 @@ class Explanation(Message):
     lines: tuple[str, ...]
 
 
-class Heard(Message):
+class StateOfPeer(Message):
     """State of another launcher, received from its node; ``None``: that node is gone."""
 
     node: str
@@ -318,7 +318,7 @@ class Stop(Message):
     """Start no further hook, finalise and end."""
 
 
-class Say(Message):
+class PublishState(Message):
     """Publish the state of this launcher to its peers."""
 
     text: str
@@ -449,7 +449,7 @@ class Ended(Message):
 
 FROM_NODES: Sequence[type[Message]] = (
     *(Hello, Loaded, Ready, Report, Probed, Hooks, Finalising, Progress, Shutdown, Failed),
-    *(Explanation, Heard, NodeStatus, AtRest, WasReset),
+    *(Explanation, StateOfPeer, NodeStatus, AtRest, WasReset),
 )
 TO_NODES: Sequence[type[Message]] = (
     *(
@@ -460,7 +460,7 @@ TO_NODES: Sequence[type[Message]] = (
         Drain,
         StopHooks,
         Stop,
-        Say,
+        PublishState,
         Leave,
         Pause,
         Resume,

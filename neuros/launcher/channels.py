@@ -23,7 +23,7 @@ import neuros.control as control
 from neuros.control import Message
 from neuros.control.link import ControlLink, encode
 from neuros.errors import ControlError
-from neuros.launcher.outcome import Outcome, Phase, SupervisorOutput
+from neuros.launcher.outcome import Outcome, Phase
 from neuros.ports import ControlListener
 
 STRANGER = "an unknown program"
@@ -260,8 +260,8 @@ class Observers:
     _told: control.PhaseChanged | None = None
     _asked: dict[int, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
-    def take(self, link: ControlLink, message: Message) -> None:
-        """Take a message from or for an observer.
+    def receive(self, link: ControlLink, message: Message) -> None:
+        """Handle a message from or for an observer.
 
         Raises:
             ControlError: if it is a packet for what is no session's input; nothing has changed.
@@ -340,21 +340,6 @@ class Observers:
         )
 
 
-@dataclass
-class Overheard:
-    """An output for people whose records observers get, too."""
-
-    _output: SupervisorOutput
-    _tell: Callable[[Message], object]
-
-    def log(self, severity: str, text: str) -> None:
-        self._output.log(severity, text)
-        self._tell(control.LogRecord(severity, text))
-
-    def poll(self) -> object:
-        return self._output.poll()
-
-
 Counts: TypeAlias = Mapping[str, tuple[int, int]]
 """By connection, packets that have passed, and those acknowledged; -1: none ever are."""
 
@@ -407,8 +392,8 @@ class Settling:
         if asker is self._asker:
             self._asker = self._due_s = None
 
-    def take(self, answer: control.AtRest) -> None:
-        """Take an answer of a process, perhaps to the last round."""
+    def add(self, answer: control.AtRest) -> None:
+        """An answer of a process has arrived, perhaps to the last round."""
         if answer.number != self._round or self._asker is None:
             return
         self._answers[answer.nodes] = answer

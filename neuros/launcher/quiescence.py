@@ -93,8 +93,8 @@ class Probing:
         self.verdict = Verdict.UNDECIDED if self._names else Verdict.DRAINED
         self._ask(now_s)
 
-    def take(self, probe: Probed) -> None:
-        """Take an answer, perhaps to the last probe."""
+    def add(self, probe: Probed) -> None:
+        """An answer has arrived, perhaps to the last probe."""
         if probe.number == self._number and probe.node in self._names:
             self._probes[probe.node] = probe
             if len(self._probes) == len(self._names):
@@ -164,10 +164,10 @@ class Probing:
             this_round = counters(probes)
             is_over, verdict = is_dead(probes, connections), Verdict.DEAD
         is_stable, self._last_round = this_round == self._last_round, this_round
-        if is_over and is_stable and (self._peers is None or self._peers.settle(probes)):
+        if is_over and is_stable and (self._peers is None or self._peers.agree_on_end(probes)):
             self.verdict = verdict
         elif self._peers is not None and not (is_over and is_stable):
-            self._peers.unsettle()
+            self._peers.go_on()
 
 
 def connections_among(files: Sequence[NodeFile]) -> list[Connection]:
@@ -333,8 +333,8 @@ class Declarations:
         }
         self._hooks: dict[str, list[DeclaredHook]] = {}
 
-    def take(self, message: Hooks) -> None:
-        """Take the declarations of a node."""
+    def add(self, message: Hooks) -> None:
+        """Keep the declarations of a node, in the place of those before its reset."""
         node = message.node
         self._hooks[node] = [
             DeclaredHook(hook.kind, hook.inputs, hook.outputs, node, place)

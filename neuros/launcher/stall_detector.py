@@ -38,6 +38,10 @@ class StallDetector:
         names: the nodes.
         now_s: the time now; all times are seconds on one monotonic clock.
         reader: reads where the threads of processes stand.
+
+    Attributes:
+        loaded: the nodes whose plugins have been imported.
+        ready: the nodes that have initialised as far as they can alone.
     """
 
     def __init__(self, names: Sequence[str], now_s: float, reader: ThreadReader) -> None:
@@ -46,8 +50,8 @@ class StallDetector:
         self._processes: dict[str, tuple[str, ...]] = {}  # by node, all nodes of its process
         self._plugins: dict[str, str] = {}
         self._silent = set(names)
-        self._loaded: set[str] = set()
-        self._ready: set[str] = set()
+        self.loaded: set[str] = set()
+        self.ready: set[str] = set()
         self._reports: dict[str, Report] = {}
         self._heard_s: dict[str, float] = {}
         self._moved: dict[str, Any] = {}
@@ -97,14 +101,6 @@ class StallDetector:
     def is_greeted(self, name: str) -> bool:
         """Whether the process of a node has said hello."""
         return name not in self._silent
-
-    def note_loaded(self, name: str) -> None:
-        """The plugin of a node has been imported."""
-        self._loaded.add(name)
-
-    def note_ready(self, name: str) -> None:
-        """A node has initialised as far as it can alone."""
-        self._ready.add(name)
 
     def has_begun(self, name: str) -> bool:
         """Whether a node may run hooks."""
@@ -164,12 +160,12 @@ class StallDetector:
             if self._silent:
                 yield "INFO", f"still starting: {', '.join(sorted(self._silent))}"
             early = [name for name in sorted(self._reports) if not self.has_begun(name)]
-            if loading := [name for name in early if name not in self._loaded]:
+            if loading := [name for name in early if name not in self.loaded]:
                 yield "INFO", f"still importing their plugins: {', '.join(loading)}"
             if waiting := self._waiting():
                 yield "INFO", f"connections still waiting for their other end: {'; '.join(waiting)}"
-            elif self.is_complete and not self._ready.issuperset(self._names):
-                initialising = [name for name in self._names if name not in self._ready]
+            elif self.is_complete and not self.ready.issuperset(self._names):
+                initialising = [name for name in self._names if name not in self.ready]
                 yield "INFO", f"still initialising: {', '.join(initialising)}"
             elif self.is_complete and self.rested_s(now_s) < STALL_S:  # else nodes are asked
                 yield from self._remarks_on_starving(now_s)
@@ -219,7 +215,7 @@ class StallDetector:
     def _remark_on_import(self, names: Sequence[str], read: ProcessThreads) -> str:
         """What a process does whose main thread lets no other run before its nodes have begun."""
         holder = read.lock_holder
-        loading = [n for n in names if n not in self._loaded and not self.has_begun(n)]
+        loading = [n for n in names if n not in self.loaded and not self.has_begun(n)]
         stacks = filter(None, map(self._read_stack, names))
         if not (holder and holder.is_main and loading) or read.stopped:
             return ""

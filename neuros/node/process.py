@@ -131,8 +131,8 @@ class NodeProcess:
                     node.stop()
             case control.Leave():
                 self._peers.leave()
-            case control.Say(text):
-                self._peers.say(text)
+            case control.PublishState(text):
+                self._peers.publish(text)
             case control.Look(wanted, asker):
                 for node in tuple(self._nodes):
                     self._tell(node.reports.look(wanted.get(node.name, {}), asker))

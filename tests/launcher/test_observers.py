@@ -61,7 +61,7 @@ class Run:
             self.channels.wait(5.0)
             for lines, message in self.channels.receive():
                 assert not isinstance(message, ControlError)
-                self.observers.take(lines, message)
+                self.observers.receive(lines, message)
                 count -= 1
 
 

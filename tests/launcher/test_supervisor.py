@@ -17,7 +17,7 @@ from neuros.backends.process_launchers import ProcessLauncher, RunningProcess
 from neuros.control import Begin, Message
 from neuros.control.link import ControlLink
 from neuros.errors import EnvironmentFault
-from neuros.launcher import shutdown
+from neuros.launcher import supervisor
 from neuros.launcher.channels import Channels
 from neuros.launcher.peers import PeerState, Stage
 
@@ -198,7 +198,7 @@ def test_one_that_has_not_started_and_outlasts_its_kill_is_named_so(
             kill(process)
 
     monkeypatch.setattr(RunningProcess, "kill", kill_at_the_second_time)
-    monkeypatch.setattr(shutdown, "_KILLED_S", 0.5)
+    monkeypatch.setattr(supervisor, "_KILLED_S", 0.5)
     interrupts = "host.hello(); host.ask('interrupt'); host.wait_for('never')"
     outcome = run(a=interrupts, b="host.hello(); time.sleep(60)")
     assert outcome.exit_code == 130
@@ -470,7 +470,7 @@ def test_there_is_no_deadlock_while_a_node_could_still_wake(run: Run) -> None:
 
 def test_nor_where_other_nodes_run_elsewhere(run: Run) -> None:
     state = PeerState("another run", "far", 1, Stage.READY).to_text()
-    hears = f"host.hello(); host.send('heard', node='b', text={state!r}); host.loaded()"
+    hears = f"host.hello(); host.send('state_of_peer', node='b', text={state!r}); host.loaded()"
     outcome = run(a=f"{hears}; host.ready(); host.serve()", duration_s=2.5, elsewhere=("b",))
     assert outcome.exit_code == 0
 

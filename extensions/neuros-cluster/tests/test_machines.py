@@ -28,7 +28,7 @@ from neuros_cluster.messages import (
 from neuros_cluster.pump import Pump
 
 from neuros.backends.control_sockets import UnixListener, connect
-from neuros.control import Hello, LiveCounters, Message, NodeStatus, Report, Say, Stop
+from neuros.control import Hello, LiveCounters, Message, NodeStatus, PublishState, Report, Stop
 from neuros.control.link import encode, to_bytes
 from neuros.errors import EnvironmentFault
 from neuros.ports import ControlStream
@@ -384,7 +384,7 @@ class TestPump:
         assert supervisor.recv(100) == hello
         supervisor.sendall(stop)
         assert node.recv(100) == stop
-        words = encode(Say("last words")) * 4_000  # more than is read at once
+        words = encode(PublishState("last words")) * 4_000  # more than is read at once
         node.sendall(words)
         node.close()
         end = NodeEnded("eye", "exit code 0")
