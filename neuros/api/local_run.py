@@ -201,7 +201,7 @@ class LocalRun:
         """State and counters of each node."""
         if self._run is not None or (not self._is_behind and self.advance(0, {}) is None):
             return None
-        return [node.reports.look({}, 0) for node in self._nodes.values()]
+        return [node.reports.status({}, 0) for node in self._nodes.values()]
 
     def reset(
         self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]

@@ -28,6 +28,8 @@ from neuros.ports import ControlListener
 
 STRANGER = "an unknown program"
 _MOST_UNSENT_BYTES = 1 << 20
+_LEFT_OUT = control.GetStatus, control.NodeStatus, control.LogRecord
+"""Messages that are left out while so much waits to be sent."""
 _READS_AT_A_TIME = 64
 _WAKING_BYTES = 1024
 
@@ -120,7 +122,7 @@ class Channels:
         if link not in self._links:
             return
         is_full = len(link.unsent) >= _MOST_UNSENT_BYTES
-        if is_full and isinstance(message, control.Look | control.NodeStatus | control.LogRecord):
+        if is_full and isinstance(message, _LEFT_OUT):
             return
         link.unsent += encode(message)
         link.flush()
@@ -271,7 +273,7 @@ class Observers:
                 self._count += 1
                 self._links[self._count] = link
                 self._told = None
-            case control.LookAll(wanted):
+            case control.GetStatus(wanted):
                 for number, each in self._links.items():
                     if each is link:
                         self._asked[number] = wanted
@@ -296,7 +298,7 @@ class Observers:
                     whither = f"'{node}.{input_name}'"
                     raise ControlError(f"a packet came for {whither}, no session's input")
                 self._channels.send_to_node(node, message)
-            case control.StepAll(count):
+            case control.Step(count):
                 self._pause.step(count, is_driven=self._is_driven())
             case control.End(reason):
                 self._end(reason)
@@ -312,7 +314,7 @@ class Observers:
         One that has asked several times since is answered once.
         """
         for number, wanted in self._asked.items():
-            self._channels.send(control.Look(wanted, number))
+            self._channels.send(control.GetStatus(wanted, number))
         self._asked.clear()
         if phase is not Phase.RUNNING and self._pause.is_on:
             self._pause.forget()

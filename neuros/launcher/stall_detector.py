@@ -15,7 +15,7 @@ from neuros.project.model import Connection
 from neuros.stacks import IMPORT, LONG_S, ProcessThreads, Stack
 
 STALL_S = 5.0
-"""After this long, nodes are asked why nothing moves."""
+"""After this long, the user is told why nothing moves."""
 
 SILENT_S = 2.0
 """A node that has not reported for this long reports no more, or not in time."""
@@ -152,6 +152,13 @@ class StallDetector:
             return False
         self._has_explained = True
         return True
+
+    def reasons(self, now_s: float) -> Iterator[tuple[str, str]]:
+        """Why nothing moves, by node; of a process that executes a hook, that is the reason."""
+        for name, report in sorted(self._reports.items()):
+            is_executing = any(map(self._executing, self._together(name)))
+            if report.reasons and not is_executing and self.silent_s(name, now_s) < SILENT_S:
+                yield "WARN", f"{name} {'; '.join(report.reasons)}"
 
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
         """Remarks for the user now, as ``(severity, text)``."""

@@ -305,9 +305,6 @@ class Supervisor:
                     self._processes.failed.add(node)
                     first_line = (text.strip() or "no reason was given").splitlines()[0]
                     self._fail(f"node '{node}' failed: {first_line}")
-            case control.Explanation(node, lines):
-                if self.phase in _BEFORE_END:
-                    self._log("WARN", f"{node} {'; '.join(lines)}")
             case control.StateOfPeer(node, text):
                 self._peers.receive(node, text, now_s)
             case control.Advance():
@@ -472,7 +469,7 @@ class Supervisor:
         for source in (self._detector, self._backlog, self._peers):
             self._show(source.remarks(now_s))
         if self.phase is Phase.RUNNING and self._detector.has_just_stalled(now_s):
-            self._channels.send(control.Explain())
+            self._show(self._detector.reasons(now_s))
         if overdue := self._peers.overdue(now_s):
             self._fail(overdue, exit_code=4)
         if self._peers.exist or not self._detector.is_complete:  # then not all can be asked

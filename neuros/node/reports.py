@@ -85,13 +85,18 @@ class NodeReports:
 
     def _state(self) -> dict[str, Any]:
         now_ns, engine = self._clock(), self._engine
-        metrics = snapshot(engine, now_ns) if engine and self._has_begun else None
+        metrics: dict[str, Any] | None = None
+        reasons: tuple[str, ...] = ()
+        if engine and self._has_begun:
+            metrics = snapshot(engine, now_ns)
+            reasons = () if metrics["executing"] else tuple(explain(engine, now_ns))
         return {
             "node": self._file.node.name,
             "waiting_for": tuple(str(each) for each in self._transport.waiting_for()),
             **self._time.report(now_ns),
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "metrics": metrics,
+            "reasons": reasons,
             "stack": self._stack(metrics),
             "fault": self._fault,
             "compressed": self._transport.compressed,
@@ -118,7 +123,7 @@ class NodeReports:
             return stack_in(self._file.node.name, self._file.node.plugin)
         return None
 
-    def look(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> NodeStatus:
+    def status(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> NodeStatus:
         """What an observer is shown: the node, and what was sampled of its packets. Any thread.
 
         Args:
@@ -151,13 +156,6 @@ class NodeReports:
             or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file)),
             is_idle=is_idle,
         )
-
-    def explain(self) -> list[str]:
-        """Why nothing moves here. Any thread."""
-        engine = self._engine
-        if engine is None:
-            return [f"imports its plugin {self._file.node.plugin_name}"]
-        return explain(engine, self._clock())
 
 
 def declared(node: str, specs: Sequence[HookSpec]) -> Hooks:

@@ -99,6 +99,21 @@ def test_a_standstill_is_asked_about_once_after_five_seconds() -> None:
     assert not detector.has_just_stalled(50.0)
 
 
+def test_each_node_tells_why_it_does_not_move_unless_it_executes_a_hook_or_is_silent() -> None:
+    detector = detector_of("a", "b", "busy", "silent")
+    for name in ("a", "b", "busy", "silent"):
+        detector.greet([name], {}, 0.0)
+        if name == "silent":
+            continue
+        found = report(name, executing=executing(9.0) if name == "busy" else None)
+        found.reasons = ("waits for `x` from b", "and more")
+        detector.report(found, 5.0)
+    assert [*detector.reasons(5.0)] == [
+        ("WARN", "a waits for `x` from b; and more"),
+        ("WARN", "b waits for `x` from b; and more"),
+    ]
+
+
 def test_the_next_standstill_is_asked_about_again() -> None:
     detector = detector_of("a")
     assert detector.has_just_stalled(5.0)
