@@ -179,10 +179,6 @@ class Probed(Report, kw_only=True):
     is_idle: bool
 
 
-class Loaded(Message):
-    """All plugins of a process are loaded; no hook starts before ``begin``."""
-
-
 class Ready(Message):
     """A node has initialised as far as it can alone; its other hooks wait for ``activate``."""
 
@@ -190,7 +186,10 @@ class Ready(Message):
 
 
 class Hooks(Message):
-    """After a plugin was loaded: the hooks that it declares; of finalise hooks the names."""
+    """A plugin is loaded: the hooks that it declares, of finalise hooks the names.
+
+    No hook starts before ``begin``.
+    """
 
     node: str
     hooks: tuple[HookDeclaration, ...]
@@ -432,7 +431,7 @@ class Ended(Message):
 
 
 FROM_NODES: Sequence[type[Message]] = (
-    *(Hello, Loaded, Ready, Report, Probed, Hooks, Finalising, Progress, Shutdown, Failed),
+    *(Hello, Ready, Report, Probed, Hooks, Finalising, Progress, Shutdown, Failed),
     *(StateOfPeer, NodeStatus, AtRest, WasReset),
 )
 TO_NODES: Sequence[type[Message]] = (

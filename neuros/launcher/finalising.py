@@ -15,7 +15,7 @@ LEAVE_S = 5.0
 _LOOK_S = 1.0
 
 
-class Finalising:
+class FinaliseTimes:
     """How long the nodes of each process have made no progress since the end began.
 
     A hook that ends, ``node.progress`` and a file that grows in the folder of a node are progress.
@@ -107,12 +107,8 @@ class Finalising:
         self._looked_s[node] = now_s
         before, now = self._sizes.get(node), _sizes(self._run_folder / node)
         self._sizes[node] = now
-        if before is not None and _has_grown(before, now):
+        if before is not None and any(now[path] > before.get(path, -1) for path in now):
             self.advance(node, now_s)
-
-
-def _has_grown(before: Mapping[str, int], now: Mapping[str, int]) -> bool:
-    return any(size > before.get(path, -1) for path, size in now.items())
 
 
 def _sizes(folder: Path) -> dict[str, int]:

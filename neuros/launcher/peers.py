@@ -112,7 +112,7 @@ def count(
     return None if found is None else int(found)
 
 
-class End(NamedTuple):
+class EndElsewhere(NamedTuple):
     """The end of the project elsewhere: its exit code, its reason, and for how long it drains."""
 
     exit_code: int
@@ -236,13 +236,13 @@ class Peers:
         if state.run not in self._others or state.number > self._others[state.run].number:
             self._others[state.run] = state
 
-    def end(self, now_s: float) -> End | None:
+    def end(self, now_s: float) -> EndElsewhere | None:
         """The end of the project elsewhere, if there is one."""
         for node, gone_s in self._gone_s.items():
             state = self._others[self._run_of[node]]
             if not state.is_ending and now_s - gone_s >= _GRACE_S:
                 machine = state.machine
-                return End(
+                return EndElsewhere(
                     1,
                     f"node '{node}' on {machine} is gone: it was killed, or {machine} or the"
                     " network to it is down",
@@ -253,7 +253,7 @@ class Peers:
             return None
         worst = max(ending, key=lambda state: state.exit_code)
         reason = f"the project ended elsewhere ({worst.origin}): {worst.reason}"
-        return End(worst.exit_code, reason, worst.drain_s)
+        return EndElsewhere(worst.exit_code, reason, worst.drain_s)
 
     def counters(self) -> Mapping[str, Mapping[str, Any]]:
         """Counters of nodes elsewhere on connections to here, of peers that are over."""

@@ -175,14 +175,10 @@ class StallDetector:
                 initialising = [name for name in self._names if name not in self.ready]
                 yield "INFO", f"still initialising: {', '.join(initialising)}"
             elif self.is_complete and self.rested_s(now_s) < STALL_S:  # else nodes are asked
-                yield from self._remarks_on_starving(now_s)
-
-    def _remarks_on_starving(self, now_s: float) -> Iterator[tuple[str, str]]:
-        """Nodes that have never got what they wait for, while others move."""
-        for name, (lacks, since_s) in self._starving.items():
-            if now_s - since_s >= STALL_S and (name, lacks) not in self._named_as_starving:
-                self._named_as_starving.add((name, lacks))
-                yield "INFO", f"{name} still waits for {lacks}, where nothing has ever come"
+                for name, (lacks, since_s) in self._starving.items():
+                    if now_s - since_s >= STALL_S and (name, lacks) not in self._named_as_starving:
+                        self._named_as_starving.add((name, lacks))
+                        yield "INFO", f"{name} still waits for {lacks}, where nothing has ever come"
 
     def remarks_on_hooks(self) -> Iterator[tuple[str, str]]:
         """Hooks that run for long, each once, with their stacks."""

@@ -24,7 +24,7 @@ from neuros.control import Message, Report
 from neuros.control.link import ControlLink
 from neuros.errors import ControlError
 from neuros.launcher.channels import Channels, Observers, PauseState, Settling
-from neuros.launcher.finalising import LEAVE_S, Finalising
+from neuros.launcher.finalising import LEAVE_S, FinaliseTimes
 from neuros.launcher.outcome import (
     EXIT_CODES,
     SIGNAL_NAMES,
@@ -35,7 +35,7 @@ from neuros.launcher.outcome import (
     names_of,
     nodes_of,
 )
-from neuros.launcher.peers import End, Peers, Stage
+from neuros.launcher.peers import EndElsewhere, Peers, Stage
 from neuros.launcher.quiescence import Declarations, Probing, Verdict, connections_among
 from neuros.launcher.stall_detector import SILENT_S, Backlog, StallDetector
 from neuros.launcher.thread_reader import ThreadReader
@@ -62,12 +62,12 @@ _KILLED_S = 5.0
 _TELL_S = 1.0
 
 
-class Event(Enum):
+class RunEvent(Enum):
     """What happens to a run."""
 
     TICK = "time has passed, or something has arrived"
     END = "a drained end is asked for: reason, drain_s, the node that asks for it"
-    ENDED_ELSEWHERE = "peers have come to their end: a peers.End"
+    ENDED_ELSEWHERE = "peers have come to their end: a peers.EndElsewhere"
     FAILURE = "a node or the run has failed"
     SIGNAL = "the user has sent a signal: its number"
 
@@ -146,7 +146,7 @@ class Supervisor:
         self._probing = Probing(self._names, connections, self._channels.send, peers_to_ask)
         self._declarations = Declarations(files)
         limits_s = {file.node.name: finalise_s or file.node.finalise_s for file in files}
-        self._finalising = Finalising(limits_s, run_folder)
+        self._finalising = FinaliseTimes(limits_s, run_folder)
         self._settling = Settling(self._names, self._channels)
         self.pause = PauseState(self._channels.send, time.monotonic)
         if is_held:
@@ -161,7 +161,7 @@ class Supervisor:
             self._channels,
             self.pause,
             lambda: self._detector.is_driven,
-            lambda reason: self._handle(Event.END, reason),
+            lambda reason: self._handle(RunEvent.END, reason),
             external if is_held else (),
         )
         # Packets that nobody counts may have a hook start in a drained run: those of connections
@@ -212,7 +212,7 @@ class Supervisor:
             self.outcome.ended_s = time.monotonic()
         return self.outcome
 
-    def _handle(self, event: Event, *details: Any) -> None:
+    def _handle(self, event: RunEvent, *details: Any) -> None:
         """Do what an event leads to in this phase; it may be nothing."""
         action = _ACTIONS.get((self.phase, event))
         if action is not None:
@@ -221,7 +221,7 @@ class Supervisor:
     def _fail(self, reason: str, exit_code: int = 1) -> None:
         """Keep a failure, in any phase; the first one ends the run."""
         self.outcome.fail(reason, exit_code)
-        self._handle(Event.FAILURE)
+        self._handle(RunEvent.FAILURE)
 
     def _log(self, severity: str, text: str) -> None:
         """Tell the user and the observers."""
@@ -232,14 +232,14 @@ class Supervisor:
 
     def _handle_signals(self) -> None:
         while self._signals:
-            self._handle(Event.SIGNAL, signal.Signals(self._signals.pop(0)))
+            self._handle(RunEvent.SIGNAL, signal.Signals(self._signals.pop(0)))
 
     def _handle_wishes(self) -> None:
         """End as the program that has started the run wishes."""
         while self._wishes:
             reason, exit_code = self._wishes.pop(0)
             if not exit_code:
-                self._handle(Event.END, reason)
+                self._handle(RunEvent.END, reason)
             elif self.phase in _BEFORE_STOP:
                 self._fail(reason, exit_code)
 
@@ -281,8 +281,6 @@ class Supervisor:
                     self._channels.send_to(link, control.PublishState(self._peers.own_state))
                 if self.pause.is_on:
                     self._channels.send_to(link, control.Pause())
-            case control.Loaded():
-                self._detector.loaded.update(self._channels.nodes_of(link))
             case control.Ready(node):
                 self._detector.ready.add(node)
             case control.Hooks(node):
@@ -298,7 +296,7 @@ class Supervisor:
                     self._log("INFO", f"{node}: {text}")
             case control.Shutdown(node, reason, drain_s):
                 because = f": {reason}" if reason else ""
-                self._handle(Event.END, f"{node} ended the project{because}", drain_s, node)
+                self._handle(RunEvent.END, f"{node} ended the project{because}", drain_s, node)
             case control.Failed(node, text):
                 # Of a run that ends well, the failure of a node that was killed does not matter.
                 if self.outcome.failures or node not in self._processes.killed:
@@ -405,8 +403,8 @@ class Supervisor:
             self._finalising.excuse(still_s)
             self.outcome.excuse(still_s)
         if end := self._peers.end(now_s):
-            self._handle(Event.ENDED_ELSEWHERE, end)
-        self._handle(Event.TICK, now_s)
+            self._handle(RunEvent.ENDED_ELSEWHERE, end)
+        self._handle(RunEvent.TICK, now_s)
         self._keep_pause()
         self._show(self._detector.remarks_on_hooks())
         if self.phase in _BEFORE_STOP:
@@ -517,10 +515,10 @@ class Supervisor:
 
     # ------------------------------------------------------------------ stopping
 
-    def _end_as_elsewhere(self, end: End) -> None:
+    def _end_as_elsewhere(self, end: EndElsewhere) -> None:
         """End where the project has ended elsewhere, and as it did there."""
         if end.exit_code == 0:
-            self._handle(Event.END, end.reason, end.drain_s)
+            self._handle(RunEvent.END, end.reason, end.drain_s)
         elif end.exit_code in EXIT_CODES.values():
             self._log("INFO", f"{end.reason}; stopping")
             self._stop_with(end.exit_code, end.reason)
@@ -642,17 +640,17 @@ class Supervisor:
 _BEFORE_END = {Phase.STARTING, Phase.RUNNING}
 _BEFORE_STOP = {*_BEFORE_END, Phase.DRAINING}
 
-_ACTIONS: Mapping[tuple[Phase, Event], Callable[..., None]] = {
-    (Phase.STARTING, Event.TICK): Supervisor._tick_starting,
-    (Phase.RUNNING, Event.TICK): Supervisor._tick_running,
-    (Phase.DRAINING, Event.TICK): Supervisor._tick_draining,
-    (Phase.STOPPING, Event.TICK): Supervisor._tick_stopping,
-    (Phase.KILLED, Event.TICK): Supervisor._tick_killed,
-    (Phase.STARTING, Event.END): Supervisor._end_once_started,
-    (Phase.RUNNING, Event.END): Supervisor._drain,
-    **{(phase, Event.ENDED_ELSEWHERE): Supervisor._end_as_elsewhere for phase in _BEFORE_STOP},
-    **{(phase, Event.FAILURE): Supervisor._stop for phase in _BEFORE_STOP},
-    **{(phase, Event.SIGNAL): Supervisor._stop_by_signal for phase in _BEFORE_STOP},
-    (Phase.STOPPING, Event.SIGNAL): Supervisor._on_further_signal,
+_ACTIONS: Mapping[tuple[Phase, RunEvent], Callable[..., None]] = {
+    (Phase.STARTING, RunEvent.TICK): Supervisor._tick_starting,
+    (Phase.RUNNING, RunEvent.TICK): Supervisor._tick_running,
+    (Phase.DRAINING, RunEvent.TICK): Supervisor._tick_draining,
+    (Phase.STOPPING, RunEvent.TICK): Supervisor._tick_stopping,
+    (Phase.KILLED, RunEvent.TICK): Supervisor._tick_killed,
+    (Phase.STARTING, RunEvent.END): Supervisor._end_once_started,
+    (Phase.RUNNING, RunEvent.END): Supervisor._drain,
+    **{(phase, RunEvent.ENDED_ELSEWHERE): Supervisor._end_as_elsewhere for phase in _BEFORE_STOP},
+    **{(phase, RunEvent.FAILURE): Supervisor._stop for phase in _BEFORE_STOP},
+    **{(phase, RunEvent.SIGNAL): Supervisor._stop_by_signal for phase in _BEFORE_STOP},
+    (Phase.STOPPING, RunEvent.SIGNAL): Supervisor._on_further_signal,
 }
 """What an event leads to in a phase; pairs that are not listed lead to nothing."""

@@ -38,7 +38,7 @@ Event = Callable[[], None]
 _REPORT_S = 1.0
 
 
-class Stage(IntEnum):
+class ProcessStage(IntEnum):
     """How far a node process has come; it never goes back."""
 
     LOADING = 0
@@ -84,7 +84,7 @@ class NodeProcess:
         self._middleware: Middleware | None = None
         self._early_events: list[Event] = []
         self._early_lock = threading.Lock()
-        self._stage, self._stage_lock = Stage.LOADING, threading.Lock()
+        self._stage, self._stage_lock = ProcessStage.LOADING, threading.Lock()
         self._has_begun = False  # whether hooks may have run; it stays while the process ends
         self._has_failed = False
         self._goes_on = threading.Event()  # begins or ends
@@ -153,7 +153,7 @@ class NodeProcess:
         nodes = self._nodes.values()
         match message:
             case control.Activate():
-                self._reach(Stage.ACTIVE)
+                self._reach(ProcessStage.ACTIVE)
                 for node in nodes:
                     node.activate()
                 for node in nodes:
@@ -188,7 +188,7 @@ class NodeProcess:
 
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""
-        self._reach(Stage.ENDING)
+        self._reach(ProcessStage.ENDING)
         self._goes_on.set()
         for node in tuple(self._nodes.values()):
             node.stop()
@@ -273,7 +273,9 @@ class NodeProcess:
                     self._fail(node.name, error)
                     return
                 self._tell(declared(node.name, node.specs))
-                start = functools.partial(node.start, awaits_others=self._stage < Stage.ACTIVE)
+                start = functools.partial(
+                    node.start, awaits_others=self._stage < ProcessStage.ACTIVE
+                )
                 self._middleware.loop.post(start)
         self._tell(control.WasReset(why_not))
 
@@ -315,7 +317,6 @@ class NodeProcess:
             except NeurosError as error:
                 self._fail(node.name, error)
         gc.freeze()
-        self._tell(control.Loaded())
         self._goes_on.wait()  # meanwhile nothing of ROS is handled: nobody can send here
         if not self.is_ending:
             self._guard(middleware.loop.run)
@@ -323,7 +324,7 @@ class NodeProcess:
 
     def _begin(self) -> None:
         self._has_begun = True
-        self._reach(Stage.INITIALISING)
+        self._reach(ProcessStage.INITIALISING)
         for node in self._nodes.values():
             node.reports.begin()
         self.report()
@@ -333,9 +334,9 @@ class NodeProcess:
     @property
     def is_ending(self) -> bool:
         """Whether no further hook starts."""
-        return self._stage is Stage.ENDING
+        return self._stage is ProcessStage.ENDING
 
-    def _reach(self, stage: Stage) -> None:
+    def _reach(self, stage: ProcessStage) -> None:
         with self._stage_lock:  # the control thread may end what the loop begins
             self._stage = max(self._stage, stage)
 
@@ -380,7 +381,7 @@ class NodeProcess:
 
     def _fail(self, name: str, error: NeurosError) -> None:
         self._has_failed = True
-        self._reach(Stage.ENDING)
+        self._reach(ProcessStage.ENDING)
         if name in self._nodes:
             self._nodes[name].failures.log(error)
         else:  # there is no logger yet
@@ -454,20 +455,17 @@ class ControlThread(threading.Thread):
 
     def _on_messages(self) -> bool:
         """Returns False once the supervisor is gone."""
-        messages = self._received(self._link)
+        try:
+            messages = self._link.receive()
+        except ControlError as error:
+            self._raise_in_loop(error)
+            return True
         if messages is None:
             self._process.on_supervisor_gone()
             return False
         for message in messages:
             self._try(functools.partial(self._process.handle, message))
         return True
-
-    def _received(self, link: ControlLink) -> list[Message] | None:
-        try:
-            return link.receive()
-        except ControlError as error:
-            self._raise_in_loop(error)
-            return []
 
     def _try(self, action: Event) -> None:
         try:

@@ -87,9 +87,14 @@ class NodeReports:
         now_ns, engine = self._clock(), self._engine
         metrics: dict[str, Any] | None = None
         reasons: tuple[str, ...] = ()
+        stack: Stack | None = None
         if engine and self._has_begun:
             metrics = snapshot(engine, now_ns)
-            reasons = () if metrics["executing"] else tuple(explain(engine, now_ns))
+            executing = metrics["executing"]
+            reasons = () if executing else tuple(explain(engine, now_ns))
+            is_long = engine.is_stopped or (executing and executing["for_s"] >= LONG_S)
+            if is_long and threading.current_thread() is not _MAIN:  # which is between two hooks
+                stack = stack_in(self._file.node.name, self._file.node.plugin)
         return {
             "node": self._file.node.name,
             "waiting_for": tuple(str(each) for each in self._transport.waiting_for()),
@@ -97,7 +102,7 @@ class NodeReports:
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "metrics": metrics,
             "reasons": reasons,
-            "stack": self._stack(metrics),
+            "stack": stack,
             "fault": self._fault,
             "compressed": self._transport.compressed,
             "is_driving": engine is not None and engine.is_driving,
@@ -111,16 +116,6 @@ class NodeReports:
         for part in (self._recorder, self._world_log):
             if part is not None and part.failure is not None:
                 return f"node '{self._file.node.name}': {part.failure}"
-        return None
-
-    def _stack(self, metrics: Mapping[str, Any] | None) -> Stack | None:
-        """The stack of the plugin, if its hook runs for long, or the node is to end."""
-        engine = self._engine
-        if engine is None or metrics is None or threading.current_thread() is _MAIN:
-            return None
-        executing = metrics["executing"]
-        if engine.is_stopped or (executing is not None and executing["for_s"] >= LONG_S):
-            return stack_in(self._file.node.name, self._file.node.plugin)
         return None
 
     def status(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> NodeStatus:

@@ -89,7 +89,7 @@ host.hello()
 Path('b.up').touch()
 while host.hear()['kind'] != 'stop':
     pass
-host.send('loaded')
+host.declare()
 host.tell('failed', text='it cannot be imported')
 Path('b.loaded').touch()
 host.wait_for('never')
@@ -107,7 +107,7 @@ time.sleep(60)
     assert told_to_begin == []
 
 
-@pytest.mark.parametrize(("tells", "goes_on_at"), [("loaded", "begin"), ("ready", "activate")])
+@pytest.mark.parametrize(("tells", "goes_on_at"), [("hooks", "begin"), ("ready", "activate")])
 def test_no_node_goes_on_before_all_have_caught_up(run: Run, tells: str, goes_on_at: str) -> None:
     """Each notes when it may go on; the last one makes the others wait until it has told."""
     goes_on = f"""
@@ -117,11 +117,11 @@ if {tells!r} == "ready":
 if NAMES == ["c"]:
     time.sleep(0.3)
     Path("c.tells").touch()
-host.send({tells!r}, **({{"node": NAMES[0]}} if {tells!r} == "ready" else {{}}))
+host.send("ready", node=NAMES[0]) if {tells!r} == "ready" else host.declare()
 host.wait_for({goes_on_at!r})
 assert Path("c.tells").exists()
 host.ask("end", reason="enough")
-host.send("loaded")
+host.declare()
 host.send("ready", node=NAMES[0])
 host.serve()
 """
@@ -179,7 +179,7 @@ def test_nothing_begins_where_not_all_could_be_started(
         raise EnvironmentFault("the third one cannot be started")
 
     monkeypatch.setattr(ProcessLauncher, "start", start_and_fail)
-    loads = "host.hello(); host.send('loaded'); Path('a.loaded').touch(); host.wait_for('begin')"
+    loads = "host.hello(); host.declare(); Path('a.loaded').touch(); host.wait_for('begin')"
     with pytest.raises(EnvironmentFault):
         run(a=loads)
     assert told_to_begin == []
