@@ -44,7 +44,7 @@ def test_private_functions_that_are_used_once() -> None:
 
 
 def test_public_classes_of_one_name() -> None:
-    hold("names in several modules", classes_in_several_modules(NEUROS), 9)
+    hold("names in several modules", classes_in_several_modules(NEUROS), 6)
 
 
 @pytest.fixture(scope="module")

@@ -212,7 +212,7 @@ class LocalRun:
         """State and counters of each node."""
         if self._run is not None or (not self._is_behind and self.advance(0, {}) is None):
             return None
-        return [node.reports.look({}, 0) for node in self._nodes.values()]
+        return [node.reports.status({}, 0) for node in self._nodes.values()]
 
     def reset(
         self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
@@ -234,7 +234,7 @@ class LocalRun:
                 except NeurosError as error:
                     self._fail(node.name, error)
                     break
-                self._declarations.take(declared(node.name, node.specs))
+                self._declarations.add(declared(node.name, node.specs))
                 self._loop.post(partial(node.start, awaits_others=not self._is_active))
             self._come_to_rest()
         return True
@@ -318,7 +318,7 @@ class LocalRun:
             is_local=True,
         )
         node.load()
-        self._declarations.take(declared(node.name, node.specs))
+        self._declarations.add(declared(node.name, node.specs))
 
     def _activate(self) -> None:
         """Every node is ready: this is time 0 of the run."""
@@ -354,7 +354,7 @@ class LocalRun:
             self._next_report_s = now_s + _REPORT_S
             for node in self._nodes.values():
                 node.reports.write_logs()
-                self._outcome.take(node.reports.report(), now_s)
+                self._outcome.add(node.reports.report(), now_s)
         packets = {}
         for name, number in known.items():
             node_name, _, output = name.partition(".")
@@ -449,7 +449,7 @@ class LocalRun:
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
                     node.reports.write_logs()
-                    outcome.take(node.reports.report(is_final=True), time.monotonic())
+                    outcome.add(node.reports.report(is_final=True), time.monotonic())
         finally:
             self._middleware.close()
             self._contexts.close()

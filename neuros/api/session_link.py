@@ -18,7 +18,7 @@ from neuros.control import (
     AtRest,
     Deliver,
     Ended,
-    LookAll,
+    GetStatus,
     Message,
     NodeStatus,
     Pause,
@@ -222,7 +222,7 @@ class LaunchedRun:
 
         if not self.is_behind:  # else a round goes on, perhaps for ever
             self.advance(0, {})  # what was sent has arrived then
-        self._send(LookAll({}))
+        self._send(GetStatus({}))
         return [*found.values()] if self._wait_for(is_last, None) else None
 
     def stop(self, reason: str) -> None:

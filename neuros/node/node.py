@@ -159,8 +159,8 @@ class NodeRuntime:
             instruments,
             contexts=contexts,
             context=self._context,
-            on_ready=self._note_ready,
-            on_initialised=self._note_initialised,
+            on_ready=self._on_ready,
+            on_initialised=self._on_hook_initialised,
         )
         world_log = None if recorder is None else WorldLog(self.run_dir, self._logger)
         self.reports = NodeReports(
@@ -414,7 +414,19 @@ class NodeRuntime:
     def _make(self) -> Engine:
         """The engine for the hooks of now."""
         node = self.file.node
-        types = {port.name: self._packet_type(port) for port in node.outputs}
+        packets = self._middleware.packets
+        jpegs = {
+            c.source_output
+            for c in self.file.connections
+            if c.is_jpeg and c.source_node == self.name
+        }
+        types = {
+            port.name: PacketType(
+                packets.packet_class(port.type),
+                packets.checker(port.type, for_jpeg=port.name in jpegs),
+            )
+            for port in node.outputs
+        }
         self.engine = self._services.engine = self._make_engine(
             node, self.file.connections, self.specs, self._effects, self._clock, types
         )
@@ -424,16 +436,16 @@ class NodeRuntime:
         self._uninitialised = sum(spec.kind is HookKind.INITIALISE for spec in self.specs)
         return self.engine
 
-    def _note_ready(self) -> None:
-        self._settle()
+    def _on_ready(self) -> None:
+        self._restore()
         self._tell(Ready(self.name))
 
-    def _note_initialised(self) -> None:
+    def _on_hook_initialised(self) -> None:
         self._uninitialised -= 1
-        self._settle()
+        self._restore()
         self._on_initialised()
 
-    def _settle(self) -> None:
+    def _restore(self) -> None:
         """Put what waits into values that were kept, once all initialise hooks have run."""
         if not self._uninitialised:
             self.keeping.settle()
@@ -456,13 +468,6 @@ class NodeRuntime:
     @property
     def _resets(self) -> list[HookSpec]:
         return [spec for spec in self._plugin if spec.kind is HookKind.RESET]
-
-    def _packet_type(self, port: Port) -> PacketType:
-        packets = self._middleware.packets
-        own = [c for c in self.file.connections if c.source_node == self.file.node.name]
-        for_jpeg = any(c.is_jpeg for c in own if c.source_output == port.name)
-        check = packets.checker(port.type, for_jpeg=for_jpeg)
-        return PacketType(packets.packet_class(port.type), check)
 
     @property
     def _loaded(self) -> Engine:
@@ -583,7 +588,7 @@ class NodeEffects:
         elif connections:
             transmit = self._transport.sender(connections)
         elif tap.observers:
-            transmit = _to_nobody
+            transmit = lambda _: None  # noqa: E731 - of an output that nothing is connected to
         else:
             return None
 
@@ -639,10 +644,6 @@ class VirtualEffects(NodeEffects):
                 "the plugin has made a subscription, timer, service or client of ROS, which are"
                 " called in real time: use inputs and hooks, or run in real time"
             )
-
-
-def _to_nobody(packet: Any) -> None:
-    """Send a packet of an output that nothing is connected to."""
 
 
 def _hook_error(spec: HookSpec, error: BaseException) -> HookError:
