@@ -1,7 +1,7 @@
 """The plugin of every node of a conformance run: its hooks are described in its environment.
 
 Each execution is one line of ``observed.jsonl`` in the node's run folder: what the hook took, what
-it sent, and when it started and ended, on the machine's monotonic clock.
+it sent, and when it started and ended, on the machine's monotonic clock, or in virtual time.
 """
 
 import array
@@ -29,6 +29,13 @@ _sequence = dict.fromkeys(_NODE["outputs"], 0)
 
 def _note(*entry):
     _LOG.write(json.dumps(entry, separators=(",", ":")) + "\n")
+
+
+def _now_ns(node):
+    if not _NODE.get("is_virtual"):
+        return time.monotonic_ns()
+    now = node.now()
+    return now.sec * 1_000_000_000 + now.nanosec
 
 
 def _fill(packet, port, number):
@@ -84,13 +91,16 @@ def _body(hook):
 
     def body(node, *arguments):
         nonlocal count
-        start_ns = time.monotonic_ns()
+        start_ns = _now_ns(node)
         count += 1
         taken = [
             _seen(declared, argument)
             for declared, argument in zip(hook["inputs"], arguments, strict=True)
         ]
-        pause_s = max(hook["sleep_ms"] / 1000, _PAUSE_S if count > _MANY else 0)
+        pause_s = max(
+            hook["sleep_ms"] / 1000,
+            _PAUSE_S if count > _MANY and not _NODE.get("is_virtual") else 0,
+        )
         if pause_s:
             time.sleep(pause_s)
         packets, sent = [], {}
@@ -111,7 +121,7 @@ def _body(hook):
             sent[port] = _sequence[port]
         if count == hook["shutdown_at"]:
             node.shutdown("as described", drain_s=2.0)
-        _note(hook["name"], start_ns, time.monotonic_ns(), taken, sent)
+        _note(hook["name"], start_ns, _now_ns(node), taken, sent)
         if not sent:
             return None
         return packets[0] if len(packets) == 1 else tuple(packets)
