@@ -21,18 +21,26 @@ from neuros.hooks import (
 )
 
 _NODE = json.loads(os.environ["CONFORMANCE"])
-_LOG = (Path(os.environ["NEUROS_RUN_DIR"]) / "observed.jsonl").open("w", buffering=1)
+_IS_VIRTUAL = _NODE.get("is_virtual", False)
+_FILE = Path(os.environ["NEUROS_RUN_DIR"]) / "observed.jsonl"
+# In virtual time nodes run in the program of the test, which must not be left an open file.
+_LOG = None if _IS_VIRTUAL else _FILE.open("w", buffering=1)
 _HEAD = struct.Struct("<IQ")
 _MANY, _PAUSE_S = 500, 0.002  # after so many executions a hook slows down
 _sequence = dict.fromkeys(_NODE["outputs"], 0)
 
 
 def _note(*entry):
-    _LOG.write(json.dumps(entry, separators=(",", ":")) + "\n")
+    line = json.dumps(entry, separators=(",", ":")) + "\n"
+    if _LOG is not None:
+        _LOG.write(line)
+        return
+    with _FILE.open("a") as log:
+        log.write(line)
 
 
 def _now_ns(node):
-    if not _NODE.get("is_virtual"):
+    if not _IS_VIRTUAL:
         return time.monotonic_ns()
     now = node.now()
     return now.sec * 1_000_000_000 + now.nanosec
@@ -97,10 +105,8 @@ def _body(hook):
             _seen(declared, argument)
             for declared, argument in zip(hook["inputs"], arguments, strict=True)
         ]
-        pause_s = max(
-            hook["sleep_ms"] / 1000,
-            _PAUSE_S if count > _MANY and not _NODE.get("is_virtual") else 0,
-        )
+        slows_down = count > _MANY and not _IS_VIRTUAL
+        pause_s = max(hook["sleep_ms"] / 1000, _PAUSE_S if slows_down else 0)
         if pause_s:
             time.sleep(pause_s)
         packets, sent = [], {}
