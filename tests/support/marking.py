@@ -60,6 +60,7 @@ BY_NAME = {
         "conformance/test_conformance.py::test_further_random_projects",
         "conformance/test_conformance.py::test_random_projects",
         "conformance/test_conformance.py::test_what_once",
+        "conformance/test_virtual_time.py",
         "extensions/neuros-learn/tests/test_datasets.py",
         "extensions/neuros-learn/tests/test_gym_environments.py",
         "extensions/neuros-learn/tests/test_gym_pictures.py",
