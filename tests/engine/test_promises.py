@@ -1,0 +1,232 @@
+"""Nodes that go on when their neighbours' promises allow it do what they do in one queue."""
+
+from __future__ import annotations
+
+import heapq
+import random
+from collections import deque
+from dataclasses import dataclass, field
+from zlib import crc32
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from neuros.engine.promises import NEVER_NS, Neighbour, Promise, Promises
+
+END_NS = 3_000
+"""Nodes send nothing after this time."""
+
+Message = tuple[int, int]  # number of the channel, arrival time
+
+
+@dataclass(frozen=True)
+class Channel:
+    source: int
+    target: int
+    delay_ns: int
+    sent_at: str  # "end" of a hook, "start" of a hook, or "arrival" of a message
+
+
+ANSWERS = ("start", "arrival")
+
+
+def drawn(*key: int) -> int:
+    return crc32(repr(key).encode())
+
+
+@dataclass
+class Behaviour:
+    """What a node does: hooks of some duration, started by messages and by ticks."""
+
+    name: int
+    channels: list[Channel]
+    period_ns: int  # 0: no ticks
+    least_ns: int
+    events: list[tuple[int, int, int]] = field(default_factory=list)  # time, order, channel or kind
+    trace: list[tuple[int, int]] = field(default_factory=list)
+    free_ns: int | None = None
+    waiting: int = 0
+    started: int = 0
+
+    def __post_init__(self) -> None:
+        if self.period_ns:
+            heapq.heappush(self.events, (self.period_ns, 1_001, 0))
+
+    @property
+    def next_ns(self) -> int:
+        """Its next event, the end of its hook left out."""
+        return min((t for t, order, _ in self.events if order != 1_000), default=NEVER_NS)
+
+    def handle(self) -> list[Message]:
+        """Handle all events of its next instant; returns what it sends."""
+        now_ns, sent = self.events[0][0], []
+        while self.events and self.events[0][0] == now_ns:
+            _, order, channel = heapq.heappop(self.events)
+            self.trace.append((now_ns, order))
+            if order == 1_000:
+                self.free_ns = None
+                for i, each in enumerate(self.channels):
+                    if each.source == self.name and each.sent_at == "end":
+                        key = drawn(self.name, self.started, i)
+                        if key % 3 and now_ns < END_NS:
+                            sent.append((i, now_ns + each.delay_ns + key % 7))
+            elif order == 1_001:
+                self.waiting += 1
+                if now_ns + self.period_ns < END_NS:
+                    heapq.heappush(self.events, (now_ns + self.period_ns, 1_001, 0))
+            elif self.channels[channel].sent_at == "end":
+                self.waiting += 1
+                came_from = self.channels[channel].source
+                for i, each in enumerate(self.channels):
+                    ends = (each.source, each.target)
+                    if each.sent_at == "arrival" and ends == (self.name, came_from):
+                        sent.append((i, now_ns + each.delay_ns))
+        if self.free_ns is None and self.waiting:
+            self.waiting = 0
+            self.started += 1
+            self.free_ns = now_ns + self.least_ns + drawn(self.name, self.started) % 40
+            heapq.heappush(self.events, (self.free_ns, 1_000, 0))
+            for i, each in enumerate(self.channels):
+                if each.source == self.name and each.sent_at == "start" and now_ns < END_NS:
+                    sent.append((i, now_ns + each.delay_ns))
+        return sent
+
+    def receive(self, channel: int, arrival_ns: int) -> None:
+        heapq.heappush(self.events, (arrival_ns, channel, channel))
+
+
+def in_order(channels: list[Channel], last: dict[int, int], message: Message) -> Message:
+    """Messages of a channel arrive in their order."""
+    channel, arrival_ns = message
+    last[channel] = max(last.get(channel, 0), arrival_ns)
+    return channel, last[channel]
+
+
+def by_one_queue(nodes: list[Behaviour], channels: list[Channel]) -> None:
+    last: dict[int, int] = {}
+    while any(node.events for node in nodes):
+        node = min((n for n in nodes if n.events), key=lambda n: n.events[0][0])
+        for message in node.handle():
+            channel, arrival_ns = in_order(channels, last, message)
+            nodes[channels[channel].target].receive(channel, arrival_ns)
+
+
+class Apart:
+    """The same nodes, each with promises of its own; messages come in any order of topics."""
+
+    def __init__(self, nodes: list[Behaviour], channels: list[Channel], seed: int) -> None:
+        self.nodes, self.channels = nodes, channels
+        self.random = random.Random(seed)
+        self.topics: dict[tuple[str, int, int], deque[object]] = {}
+        self.last: dict[int, int] = {}
+        self.now_ns = [0] * len(nodes)
+        self.promises_sent = 0
+        self.promises = [self.promises_of(node) for node in nodes]
+
+    def between(self, source: int, target: int) -> list[int]:
+        return [
+            i
+            for i, each in enumerate(self.channels)
+            if (each.source, each.target) == (source, target)
+        ]
+
+    def promises_of(self, node: Behaviour) -> Promises:
+        neighbours = []
+        for other in self.nodes:
+            inward = self.between(other.name, node.name)
+            outward = self.between(node.name, other.name)
+            if inward or outward:
+                least = [
+                    min((self.channels[i].delay_ns for i in each), default=0)
+                    for each in (inward, outward)
+                ]
+                each = Neighbour(
+                    str(other.name),
+                    len(inward),
+                    len(outward),
+                    delay_in_ns=least[0],
+                    delay_out_ns=least[1],
+                )
+                kinds = {self.channels[i].sent_at for i in outward}
+                each.hold_ns = node.least_ns if kinds <= {"end"} else 0
+                each.answers_at_once = "arrival" in kinds
+                neighbours.append(each)
+        return Promises(neighbours)
+
+    def advance(self, node: Behaviour) -> bool:
+        promises, has_acted = self.promises[node.name], False
+        while node.events and not promises.waits_for(node.events[0][0]):
+            has_acted = True
+            self.now_ns[node.name] = node.events[0][0]
+            for message in node.handle():
+                channel, arrival_ns = in_order(self.channels, self.last, message)
+                target = self.channels[channel].target
+                place = self.between(node.name, target).index(channel)
+                promises.neighbours[str(target)].send(place, arrival_ns)
+                self.put("message", node.name, channel, (channel, arrival_ns))
+        for name, promise in promises.due(
+            node.next_ns,
+            self.now_ns[node.name],
+            free_ns=node.free_ns,
+            has_acted=has_acted,
+        ):
+            self.promises_sent += 1
+            self.put("promise", node.name, int(name), promise)
+        return has_acted
+
+    def put(self, kind: str, source: int, place: int, what: object) -> None:
+        self.topics.setdefault((kind, source, place), deque()).append(what)
+
+    def run(self) -> None:
+        for node in self.nodes:
+            self.advance(node)
+        while full := [key for key, topic in self.topics.items() if topic]:
+            _, source, place = key = self.random.choice(full)
+            what = self.topics[key].popleft()
+            if isinstance(what, Promise):
+                node = self.nodes[place]
+                self.promises[place].neighbours[str(source)].receive_promise(what)
+            else:
+                channel, arrival_ns = what  # type: ignore[misc]
+                node = self.nodes[self.channels[channel].target]
+                node.receive(channel, arrival_ns)
+                place = self.between(source, node.name).index(channel)
+                self.promises[node.name].neighbours[str(source)].receive(place, arrival_ns)
+            self.advance(node)
+
+
+@st.composite
+def networks(draw: st.DrawFn) -> tuple[list[tuple[int, int]], list[Channel]]:
+    count = draw(st.integers(1, 5))
+    nodes = [
+        (draw(st.sampled_from([0, 0, 70, 300])), draw(st.sampled_from([0, 5, 200])))
+        for _ in range(count)
+    ]
+    delays = st.sampled_from([1, 2, 10, 500])
+    channels = []
+    for _ in range(draw(st.integers(0, 2 * count)) if count > 1 else 0):
+        source = draw(st.integers(0, count - 1))
+        target = draw(st.integers(0, count - 2))
+        target += target >= source
+        channels.append(Channel(source, target, draw(delays), "end"))
+        if draw(st.booleans()):
+            channels.append(Channel(target, source, draw(delays), draw(st.sampled_from(ANSWERS))))
+    return nodes, channels
+
+
+def made(nodes: list[tuple[int, int]], channels: list[Channel]) -> list[Behaviour]:
+    return [
+        Behaviour(name, channels, period, least + 1) for name, (period, least) in enumerate(nodes)
+    ]
+
+
+@given(network=networks(), seed=st.integers(0, 2**32))
+@settings(max_examples=300, deadline=None)
+def test_nodes_apart_handle_the_same_events_as_in_one_queue(
+    network: tuple[list[tuple[int, int]], list[Channel]], seed: int
+) -> None:
+    together = made(*network)
+    by_one_queue(together, network[1])
+    apart = Apart(made(*network), network[1], seed)
+    apart.run()
+    assert [node.trace for node in apart.nodes] == [node.trace for node in together]
