@@ -209,3 +209,29 @@ def test_nodes_apart_handle_the_same_events_as_in_one_queue(
     apart = Apart(made(*network), network[1], seed)
     apart.run()
     assert [node.trace for node in apart.nodes] == [node.trace for node in together]
+
+
+def test_a_source_without_answers_waits_for_a_slow_receiver() -> None:
+    """Its messages wait at the receiver: their number stays within bounds."""
+    source = Horizon("source", {}, [horizon.Channel("c", "sink", 10, 0)])
+    receiver = Horizon("sink", {"c": "source"}, [])
+    assert source.waits_for(0) == ""
+    time_ns = sent = 0
+    while not source.waits_for(time_ns):
+        source.send("c", time_ns + 10)
+        time_ns, sent = time_ns + 1, sent + 1
+        assert sent < 1_000
+    assert source.waits_for(time_ns) == "sink"
+    for _ in range(sent):
+        receiver.receive("c")
+    source.learn(receiver.news(0, 10, -1))
+    assert source.waits_for(time_ns) == "sink"  # received, and not handled
+    source.learn(receiver.news(time_ns, time_ns, -1))
+    assert source.waits_for(time_ns) == ""
+
+
+def test_messages_with_a_long_delay_are_no_backlog() -> None:
+    source = Horizon("source", {}, [horizon.Channel("c", "sink", 1_000_000, 0)])
+    for time_ns in range(10_000):
+        assert source.waits_for(time_ns) == ""
+        source.send("c", time_ns + 1_000_000)
