@@ -9,10 +9,12 @@ still reach it (its *horizon*):
 
 - Every event to come begins with an event that waits at some node, or with a message under way,
   and a chain of messages leads from there to the node. Each link of the chain takes at least the
-  least delay of its channel, and the least duration of a hook where one is needed.
+  least delay of its channel, and a node sends nothing while a hook holds it.
 - A state that is older than another can only make the horizon earlier: what a node has done since
   began with an event that its old state counts as waiting.
 - Chains through the node itself are left out: it has not done yet what they would begin with.
+- The end of a run, for which a node asks at the end of a hook, travels along the connections in
+  either direction, and nothing holds it up.
 
 That is the null-message algorithm of Chandy and Misra (1979) and Bryant (1977), with states in the
 place of promises, as link-state routing has them in the place of distances: promises that rest on
@@ -42,14 +44,11 @@ class Channel(NamedTuple):
         name: the same at both ends.
         target: the receiving node.
         delay_ns: least delay of a message.
-        hold_ns: least time from the start of a hook to a message; -1: an arrival may cause one at
-            once, also while a hook runs.
     """
 
     name: str
     target: str
     delay_ns: int
-    hold_ns: int
 
 
 class Outbox(NamedTuple):
@@ -66,23 +65,45 @@ class Outbox(NamedTuple):
     arrival_ns: int
 
 
-class NodeState(NamedTuple):
-    """The state of one node; times in nanoseconds of virtual time.
+class Ending(NamedTuple):
+    """The end of a run: when it was asked for, by which node, and how long nodes may drain."""
+
+    time_ns: int
+    node: str
+    drain_ns: int
+
+
+class Progress(NamedTuple):
+    """What a node has come to; times in nanoseconds of virtual time.
 
     Attributes:
-        version: grows with each change.
         now_ns: all events before this time are handled.
         next_ns: the next event that waits, the end of the hook left out.
         free_ns: the end of the hook that runs; -1: none runs.
+        is_ready: whether its initialise hooks have run, but for those that wait for packets.
+        zero_ns: time 0 of the run, if that has come; else -1.
+        ending: the earliest end of the run that it knows.
+    """
+
+    now_ns: int = 0
+    next_ns: int = 0
+    free_ns: int = -1
+    is_ready: bool = False
+    zero_ns: int = -1
+    ending: Ending | None = None
+
+
+class NodeState(NamedTuple):
+    """The state of one node; ``version`` grows with each change.
+
+    Attributes:
         sources: the nodes that send to the node.
         received: number of messages, by the name of the channel.
     """
 
     node: str
     version: int
-    now_ns: int
-    next_ns: int
-    free_ns: int
+    progress: Progress
     sources: Sequence[str]
     outboxes: Sequence[Outbox]
     received: Mapping[str, int]
@@ -102,13 +123,14 @@ class Horizon:
         self._sources = tuple(sorted(set(inward.values())))
         self._received = dict.fromkeys(inward, 0)
         self._outward = {channel.name: channel for channel in outward}
+        self._neighbours = {*self._sources, *(channel.target for channel in outward)}
         self._sent = dict.fromkeys(self._outward, 0)
         # Arrival times of the messages that are not received, and not handled, as far as is known.
         self._under_way: dict[str, deque[int]] = {name: deque() for name in self._outward}
         self._unhandled: dict[str, deque[int]] = {name: deque() for name in self._outward}
         self._states: dict[str, NodeState] = {}
-        self._own = NodeState(node, 0, 0, 0, -1, self._sources, (), {})
-        self._news: dict[str, NodeState] = {}
+        self._own = NodeState(node, 0, Progress(), self._sources, (), {})
+        self._reach_ns: dict[str, int] = {}
 
     # ------------------------------------------------------------------ what happens
 
@@ -122,50 +144,94 @@ class Horizon:
         """Count a message that has come, in the order of the channel."""
         self._received[channel] += 1
 
-    def learn(self, states: Iterable[NodeState]) -> None:
-        """Keep states that a neighbour has sent, and that are newer than what is known."""
+    def learn(self, states: Iterable[NodeState]) -> bool:
+        """Keep the states that are newer than what is known; returns whether there was one."""
+        has_news = False
         for state in states:
             known = self._states.get(state.node)
             if state.node != self.node and (known is None or known.version < state.version):
-                self._states[state.node] = self._news[state.node] = state
+                has_news = True
+                self._states[state.node] = state
+                if known is None:
+                    self._reach_ns.clear()
                 for name, channel in self._outward.items():
                     if channel.target == state.node:
                         self._forget(name, state)
+        return has_news
 
     # ------------------------------------------------------------------ what follows
 
-    def news(self, now_ns: int, next_ns: int, free_ns: int) -> Sequence[NodeState]:
-        """The states that the neighbours do not have: of others, and of the node if it is new.
-
-        The arguments are those of :class:`NodeState`.
-        """
+    def state(self, progress: Progress) -> NodeState:
+        """The state of the node now; it has a new version if anything has changed."""
         outboxes = tuple(
             Outbox(channel, self._sent[name], under_way[0] if under_way else NEVER_NS)
             for (name, channel), under_way in zip(
                 self._outward.items(), self._under_way.values(), strict=True
             )
         )
-        own = self._own
-        state = (now_ns, next_ns, free_ns, self._sources, outboxes, self._received)
-        if state != own[2:]:
-            self._own = self._news[self.node] = NodeState(
-                self.node, own.version + 1, *state[:-1], dict(self._received)
+        _, version, *old = self._own
+        if [progress, self._sources, outboxes, self._received] != old:
+            self._own = NodeState(
+                self.node, version + 1, progress, self._sources, outboxes, dict(self._received)
             )
-        news = tuple(self._news.values())
-        self._news.clear()
-        return news
+        return self._own
 
-    def time_ns(self) -> int:
-        """The earliest time at which a message that has not come yet can arrive."""
-        return min(self._arrivals(), default=(NEVER_NS, ""))[0]
+    @property
+    def others(self) -> Iterable[NodeState]:
+        """The newest states of the other nodes."""
+        return self._states.values()
 
     def waits_for(self, time_ns: int) -> str:
-        """A neighbour that keeps the node from its events at a time; empty if none does."""
+        """A node that keeps this one from its events at a time; empty if none does."""
         for name, queue in self._unhandled.items():
             if len(queue) > _MOST_UNHANDLED and queue[_MOST_UNHANDLED] < time_ns:
                 return self._outward[name].target
         arrival_ns, source = min(self._arrivals(), default=(NEVER_NS, ""))
         return source if arrival_ns <= time_ns else ""
+
+    def zero_ns(self, progress: Progress) -> int | None:
+        """Time 0 of the run: when nothing is left to do before it; ``None``: not yet.
+
+        That is the latest time of a node, once all are ready, no event waits and no message is
+        under way. One that has begun tells the others, whose states may never show that.
+        """
+        found = [s.progress.zero_ns for s in self._states.values() if s.progress.zero_ns >= 0]
+        if found:
+            return found[0]
+        states = {**self._states, self.node: self.state(progress)}
+        if not self._neighbours <= states.keys():
+            return None
+        for state in states.values():
+            is_idle = state.progress.next_ns == NEVER_NS and state.progress.free_ns < 0
+            if not (is_idle and state.progress.is_ready and states.keys() >= {*state.sources}):
+                return None
+            for channel, sent, _ in state.outboxes:
+                target = states.get(channel.target)
+                if target is None or target.received.get(channel.name, 0) != sent:
+                    return None
+        return max(state.progress.now_ns for state in states.values())
+
+    def ending(self) -> Ending | None:
+        """The earliest end of the run that another node knows."""
+        known = (s.progress.ending for s in self._states.values())
+        return min((each for each in known if each is not None), default=None)
+
+    def reach_ns(self) -> Mapping[str, int]:
+        """By node, the least time over connections, in either direction."""
+        if not self._reach_ns:
+            ways: dict[str, list[tuple[str, int]]] = {}
+            for state in [self.state(self._own.progress), *self._states.values()]:
+                for (_, target, delay_ns), _, _ in state.outboxes:
+                    ways.setdefault(state.node, []).append((target, delay_ns))
+                    ways.setdefault(target, []).append((state.node, delay_ns))
+            ahead = [(0, self.node)]
+            while ahead:
+                time_ns, name = heapq.heappop(ahead)
+                if name not in self._reach_ns:
+                    self._reach_ns[name] = time_ns
+                    for other, delay_ns in ways.get(name, ()):
+                        heapq.heappush(ahead, (time_ns + delay_ns, other))
+        return self._reach_ns
 
     # ------------------------------------------------------------------ inside
 
@@ -175,21 +241,20 @@ class Horizon:
         left = self._sent[name] - state.received.get(name, 0)
         while len(under_way) > left:
             under_way.popleft()
-        while len(unhandled) > left and unhandled[0] < state.now_ns:
+        while len(unhandled) > left and unhandled[0] < state.progress.now_ns:
             unhandled.popleft()
 
     def _arrivals(self) -> Iterable[tuple[int, str]]:
-        """For each way into the node, the earliest time of a message on it, and its sender."""
+        """The earliest times of messages to the node, and of an end, each with its sender."""
         states, own = self._states, self._received
-        first = {name: state.next_ns for name, state in states.items()}
-        for source in self._sources:
-            if source not in states:
-                yield 0, source
+        first = {name: state.progress.next_ns for name, state in states.items()}
+        for neighbour in self._neighbours:
+            if neighbour not in states:
+                yield 0, neighbour
         for name, under_way in self._under_way.items():
-            if under_way:
-                target = self._outward[name].target
-                if target in first:
-                    first[target] = min(first[target], under_way[0])
+            target = self._outward[name].target
+            if under_way and target in first:
+                first[target] = min(first[target], under_way[0])
         for name, state in states.items():
             if any(source not in states and source != self.node for source in state.sources):
                 first[name] = 0
@@ -206,15 +271,16 @@ class Horizon:
             time_ns, name = heapq.heappop(waiting)
             if time_ns > first[name]:
                 continue
-            state = states[name]
-            for channel, _, _ in state.outboxes:
-                if state.free_ns < 0:
-                    sent_ns = time_ns + max(0, channel.hold_ns)
-                else:
-                    sent_ns = time_ns if channel.hold_ns < 0 else state.free_ns
+            free_ns = states[name].progress.free_ns
+            sent_ns = time_ns if free_ns < 0 else free_ns
+            for channel, _, _ in states[name].outboxes:
                 arrival_ns = sent_ns + channel.delay_ns
                 if channel.target == self.node:
                     yield arrival_ns, name
                 elif arrival_ns < first.get(channel.target, 0):
                     first[channel.target] = arrival_ns
                     heapq.heappush(waiting, (arrival_ns, channel.target))
+        reach_ns = self.reach_ns()
+        for name, time_ns in first.items():
+            free_ns = states[name].progress.free_ns
+            yield (time_ns if free_ns < 0 else free_ns) + reach_ns[name], name

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuros.engine import horizon
-from neuros.engine.horizon import NEVER_NS, Horizon
+from neuros.engine.horizon import NEVER_NS, Horizon, Progress
 
 END_NS = 3_000
 """Nodes send nothing after this time."""
@@ -82,7 +82,7 @@ class Behaviour:
                 for i, each in enumerate(self.channels):
                     ends = (each.source, each.target)
                     if each.sent_at == "arrival" and ends == (self.name, came_from):
-                        sent.append((i, now_ns + each.delay_ns))
+                        sent.append((i, max(now_ns, self.free_ns or 0) + each.delay_ns))
         if self.free_ns is None and self.waiting:
             self.waiting = 0
             self.started += 1
@@ -123,16 +123,16 @@ class Apart:
         self.last: dict[int, int] = {}
         self.now_ns = [0] * len(nodes)
         self.states_sent = 0
+        self.told: list[list[horizon.NodeState]] = [[] for _ in nodes]
         self.horizons = [self.horizon_of(node) for node in nodes]
 
     def horizon_of(self, node: Behaviour) -> Horizon:
         outward = [i for i, each in enumerate(self.channels) if each.source == node.name]
-        holds = {"end": node.least_ns, "start": 0, "arrival": -1}
         return Horizon(
             str(node.name),
             {str(i): str(c.source) for i, c in enumerate(self.channels) if c.target == node.name},
             [
-                horizon.Channel(str(i), str(c.target), c.delay_ns, holds[c.sent_at])
+                horizon.Channel(str(i), str(c.target), c.delay_ns)
                 for i, c in ((i, self.channels[i]) for i in outward)
             ],
         )
@@ -151,10 +151,13 @@ class Apart:
                 target = self.channels[channel].target
                 self.put(node.name, target, str(channel), (channel, arrival_ns))
         free_ns = -1 if node.free_ns is None else node.free_ns
-        if news := mine.news(self.now_ns[node.name], node.next_ns, free_ns):
+        state = mine.state(Progress(self.now_ns[node.name], node.next_ns, free_ns))
+        states = [state, *mine.others]
+        if states != self.told[node.name]:
+            self.told[node.name] = states
             self.states_sent += 1
             for other in self.neighbours(node.name):
-                self.put(node.name, other, "time", news)
+                self.topics[node.name, other, "time"] = deque([states])  # the newest counts
 
     def put(self, source: int, target: int, topic: str, what: object) -> None:
         self.topics.setdefault((source, target, topic), deque()).append(what)
@@ -213,8 +216,9 @@ def test_nodes_apart_handle_the_same_events_as_in_one_queue(
 
 def test_a_source_without_answers_waits_for_a_slow_receiver() -> None:
     """Its messages wait at the receiver: their number stays within bounds."""
-    source = Horizon("source", {}, [horizon.Channel("c", "sink", 10, 0)])
+    source = Horizon("source", {}, [horizon.Channel("c", "sink", 10)])
     receiver = Horizon("sink", {"c": "source"}, [])
+    source.learn([receiver.state(Progress(0, NEVER_NS))])
     assert source.waits_for(0) == ""
     time_ns = sent = 0
     while not source.waits_for(time_ns):
@@ -224,14 +228,15 @@ def test_a_source_without_answers_waits_for_a_slow_receiver() -> None:
     assert source.waits_for(time_ns) == "sink"
     for _ in range(sent):
         receiver.receive("c")
-    source.learn(receiver.news(0, 10, -1))
+    source.learn([receiver.state(Progress(0, 10))])
     assert source.waits_for(time_ns) == "sink"  # received, and not handled
-    source.learn(receiver.news(time_ns, time_ns, -1))
+    source.learn([receiver.state(Progress(time_ns, time_ns))])
     assert source.waits_for(time_ns) == ""
 
 
 def test_messages_with_a_long_delay_are_no_backlog() -> None:
-    source = Horizon("source", {}, [horizon.Channel("c", "sink", 1_000_000, 0)])
+    source = Horizon("source", {}, [horizon.Channel("c", "sink", 1_000_000)])
+    source.learn([Horizon("sink", {"c": "source"}, []).state(Progress(0, NEVER_NS))])
     for time_ns in range(10_000):
         assert source.waits_for(time_ns) == ""
         source.send("c", time_ns + 1_000_000)
