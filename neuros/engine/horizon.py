@@ -55,14 +55,18 @@ class Outbox(NamedTuple):
     """What a state says of a channel at its sender.
 
     Attributes:
-        sent: number of messages.
-        arrival_ns: arrival of the first that the receiver had not received, as far as the sender
-            knows; later ones arrive later.
+        confirmed: number of messages that the receiver had received, as far as the sender knows.
+        arrivals_ns: times of arrival of the others, in their order; none comes before another.
     """
 
     channel: Channel
-    sent: int
-    arrival_ns: int
+    confirmed: int
+    arrivals_ns: Sequence[int]
+
+    def arrival_ns(self, received: int) -> int | None:
+        """When the message after so many arrives; ``None``: it is not sent."""
+        place = max(0, received - self.confirmed)
+        return self.arrivals_ns[place] if place < len(self.arrivals_ns) else None
 
 
 class Ending(NamedTuple):
@@ -116,14 +120,18 @@ class Horizon:
         node: its name.
         inward: the sending node of each channel that ends at the node, by the channel's name.
         outward: the channels that begin at the node.
+
+    Attributes:
+        neighbours: the nodes at the other ends of its channels.
     """
 
     def __init__(self, node: str, inward: Mapping[str, str], outward: Sequence[Channel]) -> None:
         self.node = node
         self._sources = tuple(sorted(set(inward.values())))
+        self._inward = inward
         self._received = dict.fromkeys(inward, 0)
         self._outward = {channel.name: channel for channel in outward}
-        self._neighbours = {*self._sources, *(channel.target for channel in outward)}
+        self.neighbours = {*self._sources, *(channel.target for channel in outward)}
         self._sent = dict.fromkeys(self._outward, 0)
         # Arrival times of the messages that are not received, and not handled, as far as is known.
         self._under_way: dict[str, deque[int]] = {name: deque() for name in self._outward}
@@ -143,6 +151,14 @@ class Horizon:
     def receive(self, channel: str) -> None:
         """Count a message that has come, in the order of the channel."""
         self._received[channel] += 1
+
+    def arrival_ns(self, channel: str) -> int | None:
+        """When the next message of a channel arrives; ``None``: its sender has not told yet."""
+        source = self._states.get(self._inward[channel])
+        for outbox in () if source is None else source.outboxes:
+            if outbox.channel.name == channel:
+                return outbox.arrival_ns(self._received[channel])
+        return None
 
     def learn(self, states: Iterable[NodeState]) -> bool:
         """Keep the states that are newer than what is known; returns whether there was one."""
@@ -164,7 +180,7 @@ class Horizon:
     def state(self, progress: Progress) -> NodeState:
         """The state of the node now; it has a new version if anything has changed."""
         outboxes = tuple(
-            Outbox(channel, self._sent[name], under_way[0] if under_way else NEVER_NS)
+            Outbox(channel, self._sent[name] - len(under_way), tuple(under_way))
             for (name, channel), under_way in zip(
                 self._outward.items(), self._under_way.values(), strict=True
             )
@@ -199,14 +215,15 @@ class Horizon:
         if found:
             return found[0]
         states = {**self._states, self.node: self.state(progress)}
-        if not self._neighbours <= states.keys():
+        if not self.neighbours <= states.keys():
             return None
         for state in states.values():
             is_idle = state.progress.next_ns == NEVER_NS and state.progress.free_ns < 0
             if not (is_idle and state.progress.is_ready and states.keys() >= {*state.sources}):
                 return None
-            for channel, sent, _ in state.outboxes:
+            for channel, confirmed, arrivals_ns in state.outboxes:
                 target = states.get(channel.target)
+                sent = confirmed + len(arrivals_ns)
                 if target is None or target.received.get(channel.name, 0) != sent:
                     return None
         return max(state.progress.now_ns for state in states.values())
@@ -248,7 +265,7 @@ class Horizon:
         """The earliest times of messages to the node, and of an end, each with its sender."""
         states, own = self._states, self._received
         first = {name: state.progress.next_ns for name, state in states.items()}
-        for neighbour in self._neighbours:
+        for neighbour in self.neighbours:
             if neighbour not in states:
                 yield 0, neighbour
         for name, under_way in self._under_way.items():
@@ -258,13 +275,16 @@ class Horizon:
         for name, state in states.items():
             if any(source not in states and source != self.node for source in state.sources):
                 first[name] = 0
-            for channel, sent, arrival_ns in state.outboxes:
-                target = channel.target
+            for outbox in state.outboxes:
+                name_, target, _ = outbox.channel
                 if target == self.node:
-                    if sent > own[channel.name]:
+                    arrival_ns = outbox.arrival_ns(own[name_])
+                    if arrival_ns is not None:
                         yield arrival_ns, name
-                elif target in states and sent > states[target].received.get(channel.name, 0):
-                    first[target] = min(first[target], arrival_ns)
+                elif target in states:
+                    arrival_ns = outbox.arrival_ns(states[target].received.get(name_, 0))
+                    if arrival_ns is not None:
+                        first[target] = min(first[target], arrival_ns)
         waiting = [(time_ns, name) for name, time_ns in first.items()]
         heapq.heapify(waiting)
         while waiting:  # Dijkstra's algorithm: the nodes in the order of their first events
