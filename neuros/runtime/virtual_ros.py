@@ -52,8 +52,10 @@ _ALL = QoSProfile(
 )
 """QoS of packets and acknowledgements: what is lost, the clock of the run decides."""
 
+# Only the newest state counts, but with a depth of 1 a state that takes the place of one that is
+# not acknowledged yet would wait for the next heartbeat of DDS, a second or more.
 _NEWEST = QoSProfile(
-    depth=1,
+    depth=256,
     reliability=QoSReliabilityPolicy.RELIABLE,
     durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
 )
@@ -66,6 +68,10 @@ class RosNodeTime(NodeTime):
 
     def announce(self, duration_ns: int) -> None:
         self._loop.tell(self.now_ns + duration_ns)
+
+    def hold(self, duration_ns: int) -> None:
+        super().hold(duration_ns)
+        self.post_loop_back(_end_of_hold)
 
     def ready(self) -> None:
         self._loop.is_ready = True
@@ -385,6 +391,10 @@ class _VirtualRos(TransportKind):
 VIRTUAL_ROS = _VirtualRos()
 
 _DECODER = msgspec.msgpack.Decoder(list[NodeState])
+
+
+def _end_of_hold() -> None:
+    """An event at the end of a hook: then the neighbours learn that the node is free."""
 
 
 def _publish(publisher: Publisher, states: Sequence[NodeState]) -> None:
