@@ -201,6 +201,15 @@ class NodeLoop(NodeEvents, Protocol):
     @property
     def zero_ns(self) -> int: ...
 
+    def announce(self, duration_ns: int) -> None:
+        """The hook that starts now takes at least so long."""
+
+    def ready(self) -> None:
+        """The initialise hooks have run, but for those that wait for packets."""
+
+    def at_zero(self, event: Callable[[], None], first_pass: Callable[[], None]) -> None:
+        """Handle two events at time 0 of the run; the second after the first of all nodes."""
+
     def hold(self, duration_ns: int) -> None:
         """The hook that has just run takes so long."""
 
@@ -213,8 +222,11 @@ class NodeLoop(NodeEvents, Protocol):
     def end(self, drain_s: float) -> None:
         """The node asks for the end: nothing happens after this instant until :meth:`drain`."""
 
-    def drain(self, event: Callable[[], None], stop: Callable[[], None]) -> None:
-        """Handle ``event`` when the end reaches the node; ``stop`` it if it drains for too long."""
+    def drain(self, event: Callable[[], None], stop: Callable[[], None], *, is_asked: bool) -> None:
+        """Handle ``event`` when the end reaches the node; ``stop`` it if it drains for too long.
+
+        ``is_asked``: a node has asked for the end; else it is now.
+        """
 
 
 class VirtualRun(EventLoop, Protocol):

@@ -289,9 +289,15 @@ class Probe(Message):
 
 
 class Drain(Message):
-    """Stop the hooks that send unasked; ``last_round``: indices of hooks that start once more."""
+    """Stop the hooks that send unasked.
+
+    Attributes:
+        last_round: indices of hooks that start once more.
+        is_asked: whether a node has asked for the end, at a time of the run's clock.
+    """
 
     last_round: Mapping[str, tuple[int, ...]]
+    is_asked: bool = False
 
 
 class Begin(Message):

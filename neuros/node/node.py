@@ -229,6 +229,12 @@ class NodeRuntime:
 
     def activate(self) -> None:
         """Every node of the project is ready: tick and function hooks may start from now on."""
+        if self._virtual is None:
+            self._activate()
+        else:
+            self._virtual.at_zero(self._activate, self.on_timer)
+
+    def _activate(self) -> None:
         if self._services.virtual_time is not None:
             self._services.virtual_time.activate()
         self._guard(self._loaded.activate)
@@ -290,16 +296,18 @@ class NodeRuntime:
         for connection in engine.send_windows:
             engine.on_registered(connection)
 
-    def drain(self, last_round: Sequence[int] = ()) -> None:
+    def drain(self, last_round: Sequence[int] = (), *, is_asked: bool = False) -> None:
         """Stop the hooks that send unasked; after a pause, the others go on.
 
-        Those of ``last_round`` (see :meth:`Engine.drain`) start at most once more.
+        Args:
+            last_round: hooks that start at most once more; see :meth:`Engine.drain`.
+            is_asked: whether a node has asked for this, at a time of the run's clock.
         """
         drain = partial(self._guard, lambda: self._loaded.drain(last_round))
         if self._virtual is None:
             drain()
         else:
-            self._virtual.drain(drain, self.stop)
+            self._virtual.drain(drain, self.stop, is_asked=is_asked)
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`."""
@@ -438,6 +446,8 @@ class NodeRuntime:
 
     def _on_ready(self) -> None:
         self._restore()
+        if self._virtual is not None:
+            self._virtual.ready()
         self._tell(Ready(self.name))
 
     def _on_hook_initialised(self) -> None:

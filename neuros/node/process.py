@@ -179,9 +179,9 @@ class NodeProcess:
                 for node in nodes:
                     node.pause()  # takes back what is left of steps, which might go on for ever
                 self._when_idle(lambda: self._reset(message))
-            case control.Drain(last_round):
+            case control.Drain(last_round, is_asked):
                 for node in nodes:
-                    node.drain(last_round.get(node.name, ()))
+                    node.drain(last_round.get(node.name, ()), is_asked=is_asked)
             case control.Pause():
                 for node in nodes:
                     node.pause()
