@@ -261,6 +261,10 @@ WorldLook: TypeAlias = "Callable[[Mapping[str, Any], int], Mapping[str, Any]]"
 """A view of a simulated world, for JSON, by the observer's request and number. Any thread."""
 
 
+Advance: TypeAlias = "Callable[[], Mapping[str, Packet]]"
+"""Steps a world that runs by itself, to packets that are due or less far; returns them."""
+
+
 class NodeContext(Protocol):
     """The node handle of hooks, as far as simulators need it."""
 
@@ -301,6 +305,12 @@ class NodeContext(Protocol):
 
     def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
         """Wait for time 0 of the run; False if ``cancelled()`` or the node ends. Other threads."""
+
+    def reading(self, value: int) -> int:
+        """A reading of what goes on by itself: that of the run in a replay, else the value."""
+
+    def drive(self, advance: Advance) -> bool:
+        """Whether the node advances a world that runs by itself, so that no thread has to."""
 
     def show_world(self, look: WorldLook) -> None:
         """Show a simulated world to observers; see :mod:`neuros.simulators.mujoco.scene`."""

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from neuros.node.copies import copy_seeds
 from neuros.node.failures import Failures, as_node_error
 from neuros.node.keeping import Keeping
 from neuros.node.simulated_time import SimulatedTime
-from neuros.ports import EventLoop, Logger, Packets, WorldLook
+from neuros.ports import Advance, EventLoop, Logger, Packets, WorldLook
 from neuros.project.model import Node, NodeFile
 from neuros.project.suggest import did_you_mean
 
@@ -31,6 +32,8 @@ class PluginServices:
         ask_for_end: called with ``reason`` and ``drain_s``, the seconds for draining.
         tell_progress: called with what a plugin says of its progress.
         show_world: called with what shows the simulated world of the node.
+        drive: called with what advances a world that runs by itself; returns whether the node does
+            that, so that no thread has to.
 
     Attributes:
         closers: called once when the node ends, last added first.
@@ -53,10 +56,12 @@ class PluginServices:
         ask_for_end: Callable[..., object],
         tell_progress: Callable[[str], object],
         show_world: Callable[[WorldLook], None],
+        drive: Callable[[Advance], bool],
         results: Results,
         keeping: Keeping,
     ) -> None:
         self.engine: Engine | None = None
+        self._thread_id = threading.get_ident()
         self.is_ending = False
         self.is_active = threading.Event()
         self.waiting_threads: set[threading.Thread] = set()
@@ -67,6 +72,7 @@ class PluginServices:
         self._ask_for_end = ask_for_end
         self.tell_progress = tell_progress
         self.show_world = show_world
+        self.drive = drive
         self.results = results
         self.keeping = keeping
         self.closers: list[Callable[[], None]] = []
@@ -90,6 +96,15 @@ class PluginServices:
                 self.closers.pop()()
             except BaseException as error:  # the others must still be closed
                 self._failures.report(as_node_error(error, "failed while it was closed: "))
+
+    def reading(self, value: int) -> int:
+        """What a hook reads of something that goes on by itself; any other thread just reads it."""
+        engine = self.engine
+        is_hook = engine is not None and engine.executing is not None
+        if not is_hook or threading.get_ident() != self._thread_id:
+            return value
+        assert engine is not None
+        return engine.reading(value)
 
     def note_time(self) -> bool:
         """Simulated time has gone on in another thread; returns whether it is not over."""
@@ -190,7 +205,7 @@ class NodeHandle:
 
         It is simulated where the node has a simulator or a clock, and 0 before that is known.
         """
-        return self._services.time.stamp()
+        return self._services.time.stamp(lambda: self.reading(time.time_ns()))
 
     def make_packet(self, output: str | None = None) -> Any:
         """A new message for an output, with default values, or an array of zeros.
@@ -363,6 +378,25 @@ class NodeHandle:
     def note_simulated_time(self) -> bool:
         """Tell, from any thread, that it has gone on; returns whether it is to go on further."""
         return self._services.note_time()
+
+    def reading(self, value: int) -> int:
+        """A reading, from 0, of something that goes on by itself, such as a clock of a device.
+
+        A hook that computes with what this returns does the same in a replay: a recorded run keeps
+        the value, and a replay returns that one. Elsewhere than in a hook, it is just the value.
+        """
+        return self._services.reading(value)
+
+    def drive(self, advance: Advance) -> bool:
+        """Have a world that runs by itself advanced without a thread of its own.
+
+        Args:
+            advance: goes on to the next packets that are due, and returns them by output.
+
+        Returns:
+            Whether the node does that, as in a replay; else the simulator needs its thread.
+        """
+        return self._services.drive(advance)
 
     def show_world(self, look: WorldLook) -> None:
         """Let observers look at a simulated world, as the dashboard does."""

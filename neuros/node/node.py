@@ -29,7 +29,7 @@ from neuros.node.plugin import describe, last_line, load_plugin
 from neuros.node.reports import NodeReports
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
-from neuros.ports import Middleware, PacketRecorder, Transport, Way
+from neuros.ports import Advance, Middleware, PacketRecorder, Transport, Way
 from neuros.project.model import Connection, NodeFile, Port
 
 LAST_PACKETS = "last_packets"
@@ -54,6 +54,7 @@ class NodeRuntime:
         is_held: whether hooks stand still from the start, as paused, and the newest packets of each
             output are kept.
         is_local: whether the session that holds it is in the same thread.
+        drive: see :meth:`NodeHandle.drive`.
 
     Attributes:
         histories: the newest packets, where they are kept.
@@ -81,6 +82,7 @@ class NodeRuntime:
         make_engine: Callable[..., Engine] = Engine,
         is_held: bool = False,
         is_local: bool = False,
+        drive: Callable[[Advance], bool] = lambda _: False,
     ) -> None:
         self.file = file
         self.name = file.node.name
@@ -117,6 +119,7 @@ class NodeRuntime:
             lambda reason, drain_s: tell(Shutdown(self.name, reason, drain_s)),
             lambda text: tell(Progress(self.name, text)),
             lambda look: self.reports.show_world(look),
+            drive,
             Results(self.run_dir),
             self.keeping,
         )
@@ -196,7 +199,9 @@ class NodeRuntime:
         """
         self._enter()
         self._transport.open(self)
-        self._middleware.mark_own_entities(self.file, self._enter, self.failures.report_callback)
+        self._middleware.mark_own_entities(
+            self.file, self._enter_callback, self.failures.report_callback
+        )
         self._load_plugin()
         self.reports.open(self._make(), self._logger)
 
@@ -371,6 +376,11 @@ class NodeRuntime:
     def _environment(self, variables: Mapping[str, str]) -> dict[str, str]:
         own = {**self.file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
         return {**own, **variables}
+
+    def _enter_callback(self) -> None:
+        self._enter()
+        if self.engine is not None:
+            self.engine.note_callback()
 
     def _load_plugin(self) -> None:
         node = self.file.node

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -62,13 +61,13 @@ class SimulatedTime:
             return self._read_s()
         return None if self.clock.now_ns is None else self.clock.now_ns / 1e9
 
-    def stamp(self) -> Any:
+    def stamp(self, wall_ns: Callable[[], int]) -> Any:
         """A stamp of now: simulated where the node owns time or has a clock, else wall time."""
         if self._read_s is not None:
             return to_stamp(self._read_s())
         if self._has_clock or self.is_watched:
             return to_stamp(nanoseconds=self.clock.now_ns or 0)
-        return to_stamp(nanoseconds=time.time_ns())
+        return to_stamp(nanoseconds=wall_ns())
 
     def begin_anew(self, *, keeps_owner: bool) -> None:
         """The node was reset; ``keeps_owner``: the simulator that has the time goes on."""

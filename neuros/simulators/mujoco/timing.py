@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from fractions import Fraction
 
-from neuros.ports import NodeContext, Packet
+from neuros.ports import Advance, NodeContext
 
 _LARGEST_DENOMINATOR = 1_000_000
 _TIMESTEP_TOLERANCE = Fraction(1, 10_000_000)
@@ -224,7 +224,7 @@ class FreeRun:
 
     It begins at time 0 of the run, and ends when the simulated time of the run is over. Sending
     waits while a reliable connection is blocked; visitors of the lock may use model and data
-    meanwhile. An error ends the node.
+    meanwhile. An error ends the node. In a replay, the node advances the world without a thread.
 
     Args:
         advance: runs one bout and returns the packets that are due after it, by output.
@@ -239,7 +239,7 @@ class FreeRun:
         self,
         node: NodeContext,
         lock: StepLock,
-        advance: Callable[[], Mapping[str, Packet]],
+        advance: Advance,
         sim_time: Callable[[], float],
         finish: Callable[[], None],
         idle: Callable[[], None] | None,
@@ -251,6 +251,7 @@ class FreeRun:
         self._advance, self._sim_time, self._finish = advance, sim_time, finish
         self._idle = idle
         self._stopped = threading.Event()
+        self._is_driven = False
         self.pacer = Pacer(factor, clock, wait or self._stopped.wait)
         self._thread = threading.Thread(
             target=self._run, name=f"{node.name}: simulation", daemon=True
@@ -258,16 +259,18 @@ class FreeRun:
 
     @property
     def is_running(self) -> bool:
-        return self._thread.is_alive() and not self._stopped.is_set()
+        return (self._is_driven or self._thread.is_alive()) and not self._stopped.is_set()
 
     def start(self) -> None:
-        self._thread.start()
+        self._is_driven = self._node.drive(self._advance)
+        if not self._is_driven:
+            self._thread.start()
 
     def stop(self) -> None:
         """End the thread and wait for its end; callable again, and in the thread itself."""
         self._stopped.set()
         self._lock.wake()
-        if self._thread is not threading.current_thread():
+        if not self._is_driven and self._thread is not threading.current_thread():
             self._thread.join(_JOIN_S)
 
     def _run(self) -> None:
