@@ -324,6 +324,13 @@ class NodeContext(Protocol):
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
 
+    def on_change(
+        self,
+        callback: Callable[[], object],
+        check: Callable[[Mapping[str, str]], object] = lambda _: None,
+    ) -> None:
+        """Call ``callback`` when a fork has changed the environment, and ``check`` before."""
+
     def fail(self, error: BaseException) -> None:
         """End the node with an error from outside of hooks. Any thread."""
 

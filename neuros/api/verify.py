@@ -152,6 +152,26 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> RunComparison:
     return comparer.result()
 
 
+def first_difference(
+    a: PastRun, b: PastRun, counts: Mapping[str, int], recorded: RecordedPackets
+) -> tuple[int, str]:
+    """Compare the first packets of connections: how many, and in which one the runs differ first.
+
+    Args:
+        counts: by connection, how many packets to compare.
+    """
+    compared, difference = 0, ""
+    for name in (name for name in counts if name in a.connections and name in b.connections):
+        in_a, in_b = (
+            _between(each, 0, counts[name]) for each in packets_of_both(name, (a, b), recorded)
+        )
+        compared += _first_difference(in_a.sent, in_b.sent)
+        found = _sent(name, in_a, in_b)
+        if found is not None and not difference and not in_a.sent_before + in_b.sent_before:
+            difference = found.text
+    return compared, difference
+
+
 class _Comparer:
     """Compares two runs, connection by connection."""
 
@@ -190,7 +210,7 @@ class _Comparer:
 
     def compare(self, name: str) -> None:
         """Compare the packets of a connection that both runs have."""
-        both = _packets(name, self._runs, self._recorded)
+        both = packets_of_both(name, self._runs, self._recorded)
         counts = [run.connections[name]["sent"] for run in self._runs]
         lacking = [
             str(run.folder)
@@ -257,7 +277,7 @@ class _Comparer:
         return _Difference(np.inf, f"{name}: hooks took {a} packets in run A, and {b} in run B")
 
 
-def _packets(
+def packets_of_both(
     name: str, runs: tuple[PastRun, PastRun], recorded: RecordedPackets
 ) -> tuple[PacketLists, PacketLists]:
     """The lists of both runs, with digests from their bags where nodes have kept none.

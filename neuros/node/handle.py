@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from neuros.engine.engine import Engine
 from neuros.errors import ModelError, NodeError
@@ -22,6 +22,7 @@ from neuros.project.model import Node, NodeFile
 from neuros.project.suggest import did_you_mean
 
 _POLL_S = 0.05
+Check: TypeAlias = "Callable[[Mapping[str, str]], object]"
 _EMPTY = "std_msgs/msg/Empty"
 
 
@@ -37,6 +38,7 @@ class PluginServices:
 
     Attributes:
         closers: called once when the node ends, last added first.
+        changes: called when environment or parameters have changed, and before, as a check.
         engine: the node's, ``None`` until its plugin is loaded.
         is_active: set at time 0 of the run, when every node of the project is ready.
         is_ending: whether no further hook starts.
@@ -76,6 +78,7 @@ class PluginServices:
         self.results = results
         self.keeping = keeping
         self.closers: list[Callable[[], None]] = []
+        self.changes: list[tuple[Callable[[], object], Check]] = []
 
     def stop(self) -> None:
         """Start no further hook. Any thread."""
@@ -405,6 +408,17 @@ class NodeHandle:
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
         self._services.closers.append(callback)
+
+    def on_change(self, callback: Callable[[], object], check: Check = lambda _: None) -> None:
+        """Call ``callback`` when a fork of the run has changed environment or parameters.
+
+        That is between two hooks; by then, ``os.environ`` and the parameters have the new values.
+
+        Args:
+            check: called with the variables that will change, long before; what it raises ends the
+                fork.
+        """
+        self._services.changes.append((callback, check))
 
     def fail(self, error: BaseException) -> None:
         """End the node as failed, from any thread: for errors that no hook can raise."""

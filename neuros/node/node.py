@@ -17,10 +17,10 @@ from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
-from neuros.errors import ControlError, HookError, NeurosError, ProtocolError
+from neuros.errors import ControlError, HookError, NeurosError, NodeError, ProtocolError
 from neuros.hooks import HookKind, HookSpec, hook_specs_of
 from neuros.node.context import ContextSwitch
-from neuros.node.failures import Failures
+from neuros.node.failures import Failures, as_node_error
 from neuros.node.handle import NodeHandle, PluginServices, Results
 from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Tap
 from neuros.node.keeping import Keeping
@@ -278,6 +278,33 @@ class NodeRuntime:
         for connection in engine.send_windows:
             engine.on_registered(connection)
 
+    def change(
+        self,
+        variables: Mapping[str, str],
+        parameters: Mapping[str, Any],
+        *,
+        only_checks: bool = False,
+    ) -> None:
+        """Change the environment and the parameters, between two hooks; a fault ends the node.
+
+        Args:
+            only_checks: whether to check that this is possible, and to change nothing.
+        """
+        self._enter()
+        try:
+            if only_checks:
+                for _, check in self._services.changes:
+                    check(variables)
+                return
+            self._contexts.change(self._context, variables)
+            self._set_parameters(parameters)
+            for apply, _ in self._services.changes:
+                apply()
+        except BaseException as error:
+            text = "the change of a fork: "
+            known = isinstance(error, NeurosError)
+            self.failures.report(error if known else as_node_error(error, text))
+
     def drain(self, last_round: Sequence[int] = ()) -> None:
         """Stop the hooks that send unasked; after a pause, the others go on.
 
@@ -381,6 +408,15 @@ class NodeRuntime:
         self._enter()
         if self.engine is not None:
             self.engine.note_callback()
+
+    def _set_parameters(self, parameters: Mapping[str, Any]) -> None:
+        """Raises ``NodeError`` if the plugin refuses a value."""
+        ros_node = self._middleware.ros_node(self.file)
+        for name, value in parameters.items():
+            kind = type(ros_node.get_parameter(name))
+            (result,) = ros_node.set_parameters([kind(name, value=value)])
+            if not result.successful:
+                raise NodeError(f"parameter '{name}' cannot be {value!r}: {result.reason}")
 
     def _load_plugin(self) -> None:
         node = self.file.node

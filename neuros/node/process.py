@@ -168,6 +168,10 @@ class NodeProcess:
                     node.step(count, is_driven=is_driven)
                 case control.Deliver(name, input_name, data) if name == node.name:
                     node.deliver(input_name, data)
+                case control.Change(name) if name == node.name:
+                    node.change(
+                        message.variables, message.parameters, only_checks=message.only_checks
+                    )
 
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""

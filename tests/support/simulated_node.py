@@ -100,6 +100,7 @@ class SimulatedNode:
         self.is_blocked = False
         self.is_waiting = False
         self.closers: list[Callable[[], None]] = []
+        self.changes: list[Any] = []
         self.failures: list[BaseException] = []
         self.read_time_s: Callable[[], float] = lambda: -1.0
         self.ends_at_s = float("inf")
@@ -138,6 +139,13 @@ class SimulatedNode:
 
     def on_close(self, callback: Callable[[], None]) -> None:
         self.closers.append(callback)
+
+    def on_change(
+        self,
+        callback: Callable[[], object],
+        check: Callable[[Mapping[str, str]], object] = lambda _: None,
+    ) -> None:
+        self.changes.append((callback, check))
 
     def fail(self, error: BaseException) -> None:
         with self.changed:

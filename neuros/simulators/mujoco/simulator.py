@@ -77,6 +77,7 @@ class MuJoCo:
         node.own_simulated_time(lambda: self.sim_time)
         node.show_world(self._view.observe)
         node.on_close(self.close)
+        node.on_change(self._change_fields, self._world.check_fields)
 
     # ---- what it is -------------------------------------------------------------------------
 
@@ -301,6 +302,10 @@ class MuJoCo:
         view.is_stepping = False
         if self._viewer is not None:
             self._viewer.sync()
+
+    def _change_fields(self) -> None:
+        with self.paused():
+            self._world.change_fields()
 
     def _seen_steps(self) -> int:
         """After how many steps a hook sees a world that steps itself; a replay goes on to there."""

@@ -1,0 +1,79 @@
+"""Settings that change a run while it goes on, as a fork does."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeAlias
+
+from neuros.errors import UsageError
+from neuros.project.model import Project
+from neuros.project.suggest import did_you_mean
+
+Changes: TypeAlias = "Mapping[str, tuple[Mapping[str, str], Mapping[str, Any]]]"
+"""By node, the variables of its environment and the parameters of its ROS node that change."""
+
+_KINDS = ("environment", "parameters")
+_WHAT = (
+    "a fork changes nodes.NODE.environment.VARIABLE, nodes.NODE.parameters.NAME and"
+    " NODE.model.FIELD, each to a value"
+)
+
+
+def settings_of(texts: Sequence[str]) -> dict[str, Any]:
+    """The values of ``--set PATH=VALUE``.
+
+    Raises:
+        UsageError: for a text without a path or value.
+    """
+    found: dict[str, Any] = {}
+    for text in texts:
+        path, _, value = text.partition("=")
+        if not (path and value):
+            raise UsageError(f"--set {text}: write PATH=VALUE; {_WHAT}")
+        found[path] = value
+        if path.split(".")[2:3] != ["environment"]:
+            try:
+                found[path] = json.loads(value)
+            except ValueError:
+                continue
+    return found
+
+
+def changes_of(project: Project, changed: Project, settings: Mapping[str, Any]) -> Changes:
+    """What nodes are told at the moment of a fork.
+
+    Args:
+        project: as the run began.
+        changed: with the settings.
+        settings: by path, without fields of models (:func:`neuros.api.loading.with_model_fields`).
+
+    Raises:
+        UsageError: with all paths that a fork cannot change; for a parameter that is new.
+    """
+    wrong = [path for path, value in settings.items() if not _is_for_fork(path, value)]
+    if wrong:
+        raise UsageError(f"set: {', '.join(wrong)}: {_WHAT}")
+    found = {}
+    for before, after in zip(project.nodes, changed.nodes, strict=True):
+        variables = _differing(before.environment, after.environment)
+        parameters = _differing(before.parameters, after.parameters)
+        for name in parameters.keys() - before.parameters.keys():
+            hint = did_you_mean(name, before.parameters) or _has(before.parameters)
+            raise UsageError(f"set: node '{before.name}' has no parameter '{name}' ({hint})")
+        if variables or parameters:
+            found[before.name] = variables, parameters
+    return found
+
+
+def _is_for_fork(path: str, value: Any) -> bool:
+    parts = path.split(".")
+    return len(parts) > 3 and parts[0] == "nodes" and parts[2] in _KINDS and value is not None
+
+
+def _differing(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in after.items() if before.get(name) != value}
+
+
+def _has(names: Iterable[str]) -> str:
+    return f"it has {', '.join(names) or 'none'}"
