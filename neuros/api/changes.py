@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
+from neuros.api.loading import with_model_fields
 from neuros.errors import UsageError
 from neuros.project.model import Project
 from neuros.project.suggest import did_you_mean
@@ -40,21 +41,29 @@ def settings_of(texts: Sequence[str]) -> dict[str, Any]:
     return found
 
 
-def changes_of(project: Project, changed: Project, settings: Mapping[str, Any]) -> Changes:
+def changes_of(
+    project: Project,
+    settings: Mapping[str, Any],
+    load: Callable[[Mapping[str, Any]], Project],
+) -> Changes:
     """What nodes are told at the moment of a fork.
 
     Args:
         project: as the run began.
-        changed: with the settings.
-        settings: by path, without fields of models (:func:`neuros.api.loading.with_model_fields`).
+        settings: by path.
+        load: checks the project with settings, and returns it.
 
     Raises:
         UsageError: with all paths that a fork cannot change; for a parameter that is new.
+        ProjectError: as ``load``.
     """
+    settings = with_model_fields(project, settings)
     wrong = [path for path, value in settings.items() if not _is_for_fork(path, value)]
     if wrong:
         raise UsageError(f"set: {', '.join(wrong)}: {_WHAT}")
-    found = {}
+    if not settings:
+        return {}
+    changed, found = load(settings), {}
     for before, after in zip(project.nodes, changed.nodes, strict=True):
         variables = _differing(before.environment, after.environment)
         parameters = _differing(before.parameters, after.parameters)

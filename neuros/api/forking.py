@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neuros.api.changes import Changes, changes_of
-from neuros.api.loading import override_texts, with_model_fields
+from neuros.api.changes import changes_of
+from neuros.api.loading import override_texts
 from neuros.api.project import LOCAL, Project, StartOptions
 from neuros.api.run import Run
 from neuros.api.run_record import open_run
@@ -68,12 +68,12 @@ def fork_run(
     """
     past = open_run(folder)
     project, chosen = _again(past.record, folder, at_sim_s, options)
-    changes: Changes = {}
-    if settings:
-        described = project.described(chosen)
-        fields = with_model_fields(described, settings)
-        texts = [*override_texts(chosen.set), *override_texts(fields)]
-        changes = changes_of(described, project.described(replace(chosen, set=texts)), fields)
+    texts = override_texts(chosen.set)
+    changes = changes_of(
+        project.described(chosen),
+        settings or {},
+        lambda more: project.described(replace(chosen, set=[*texts, *override_texts(more)])),
+    )
     about = {
         "run": str(folder),
         "run_id": past.record.get("run_id"),

@@ -108,6 +108,7 @@ class Session:
         self._outputs: dict[str, _Received] = {}
         self.runs: list[Run] = []
         self._settings: Mapping[str, Any] = settings or {}  # with which the run began
+        self._latest = self._settings  # of the last reset, whether it began a run or not
         self._checked: set[str] = set()  # paths of settings
         self._hold(prepare(seed, self._settings).start({}, fork or {}))
         self._usual = self._project if not settings else prepare(seed, {}).project
@@ -256,7 +257,7 @@ class Session:
                 values = {f"{node}.{name}": run for node in kept for name in kept[node]}
                 self._hold(start(values, {}))
                 self._settings = settings
-            self._seed = seed
+            self._seed, self._latest = seed, settings
             if kept:
                 self._why_no_fork = "values were kept over its reset: reset it without keep"
 
@@ -280,18 +281,18 @@ class Session:
         """
         with self._lock:
             self._check_running()
-            prepared = self._prepare(self._seed, self._settings)
+            prepared = self._prepare(self._seed, self._latest)
             why = why_not_repeatable(prepared.project, is_stepped=prepared.is_stepped)
             why += [self._why_no_fork] if self._why_no_fork else []
             if why:
                 raise UsageError(
                     "\n".join(["the session cannot be forked:", *(f"  {each}" for each in why)])
                 )
-            settings = with_model_fields(prepared.project, set or {})
-            changes: Changes = {}
-            if settings:
-                changed = self._prepare(self._seed, {**self._settings, **settings}).project
-                changes = changes_of(prepared.project, changed, settings)
+            changes = changes_of(
+                prepared.project,
+                set or {},
+                lambda more: self._prepare(self._seed, {**self._latest, **more}).project,
+            )
             counts, journal = self.sent_counts(), [*self._journal]
             about = {
                 "run": str(self.folder),
@@ -302,7 +303,7 @@ class Session:
                 self._prepare,
                 self._seed,
                 about,
-                settings=self._settings,
+                settings=self._latest,
                 is_forkable=self._is_forkable,
             )
         try:

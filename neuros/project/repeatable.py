@@ -32,13 +32,12 @@ def _threads(project: Project) -> Iterator[str]:
 
 
 def _outside(project: Project) -> Iterator[str]:
-    senders = {c.source_node for c in project.connections}
     feeds = Counter((c.destination_node, c.destination_input) for c in project.connections)
     for node in project.nodes:
         for port in node.inputs:
             if port.external_topic is not None:
                 yield f"{node.name}.{port.name}: other programs send on {port.external_topic}"
-        if node.name not in senders and not any(port.external_topic for port in node.outputs):
+        if not node.outputs:
             continue  # as a plot: nothing follows from what it does
         into = [c for c in project.connections if c.destination_node == node.name]
         for connection in into:
