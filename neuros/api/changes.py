@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 from neuros.api.loading import with_model_fields
@@ -14,7 +14,7 @@ from neuros.project.suggest import did_you_mean
 Changes: TypeAlias = "Mapping[str, tuple[Mapping[str, str], Mapping[str, Any]]]"
 """By node, the variables of its environment and the parameters of its ROS node that change."""
 
-_KINDS = ("environment", "parameters")
+_KINDS = (["environment"], ["parameters"])
 _WHAT = (
     "a fork changes nodes.NODE.environment.VARIABLE, nodes.NODE.parameters.NAME and"
     " NODE.model.FIELD, each to a value"
@@ -58,7 +58,13 @@ def changes_of(
         ProjectError: as ``load``.
     """
     settings = with_model_fields(project, settings)
-    wrong = [path for path, value in settings.items() if not _is_for_fork(path, value)]
+    parts = {path: path.split(".") for path, value in settings.items() if value is not None}
+    possible = {
+        path
+        for path, (kind, *rest) in parts.items()
+        if kind == "nodes" and len(rest) > 2 and rest[1:2] in _KINDS
+    }
+    wrong = [path for path in settings if path not in possible]
     if wrong:
         raise UsageError(f"set: {', '.join(wrong)}: {_WHAT}")
     if not settings:
@@ -68,21 +74,13 @@ def changes_of(
         variables = _differing(before.environment, after.environment)
         parameters = _differing(before.parameters, after.parameters)
         for name in parameters.keys() - before.parameters.keys():
-            hint = did_you_mean(name, before.parameters) or _has(before.parameters)
+            known = ", ".join(before.parameters) or "none"
+            hint = did_you_mean(name, before.parameters) or f"it has {known}"
             raise UsageError(f"set: node '{before.name}' has no parameter '{name}' ({hint})")
         if variables or parameters:
             found[before.name] = variables, parameters
     return found
 
 
-def _is_for_fork(path: str, value: Any) -> bool:
-    parts = path.split(".")
-    return len(parts) > 3 and parts[0] == "nodes" and parts[2] in _KINDS and value is not None
-
-
 def _differing(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in after.items() if before.get(name) != value}
-
-
-def _has(names: Iterable[str]) -> str:
-    return f"it has {', '.join(names) or 'none'}"

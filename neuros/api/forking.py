@@ -105,6 +105,11 @@ def _again(
     file = Path(record["file"])
     if record["backend"] == LOCAL or SESSION in told:
         raise UsageError(f"{folder} is the run of a session: fork that in its program (fork())")
+    if record.get("fork", {}).get("set"):
+        raise UsageError(
+            f"{folder}: it is a fork with settings itself: fork the run that it began with,"
+            f" {record['fork']['run']}"
+        )
     if not file.is_file():
         raise UsageError(
             f"{folder}: its project file is gone, or it was described in Python: {file}"

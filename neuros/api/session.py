@@ -308,8 +308,14 @@ class Session:
             )
         try:
             other.change(changes, only_checks=True)
-            for name, arguments in journal:
-                other._repeat(name, arguments)
+            for what, arguments in journal:
+                if what == "advance":
+                    other._advance(arguments[0], None, arguments[1])
+                elif what == "send":
+                    other._held.deliver(*arguments)
+                    other._note(what, *arguments)
+                else:
+                    other.change(*arguments)
             if (found := other.sent_counts()) != counts:
                 name = next(name for name in counts if counts[name] != found.get(name))
                 raise RunError(
@@ -360,16 +366,6 @@ class Session:
             self._journal[-1] = name, (arguments[0] + last[1][0], None)
         else:
             self._journal.append((name, arguments))
-
-    def _repeat(self, name: str, arguments: tuple[Any, ...]) -> None:
-        """Do what the session of which this is a fork has done."""
-        if name == "advance":
-            self._advance(arguments[0], None, arguments[1])
-        elif name == "send":
-            self._held.deliver(*arguments)
-            self._note(name, *arguments)
-        else:
-            self.change(*arguments)
 
     def _kept(self, asked: bool | str | Sequence[str]) -> dict[str, list[str]]:
         """The names of the values that a reset keeps, by node."""

@@ -160,16 +160,29 @@ def first_difference(
     Args:
         counts: by connection, how many packets to compare.
     """
-    compared, difference = 0, ""
+    compared, differences = 0, []
     for name in (name for name in counts if name in a.connections and name in b.connections):
         in_a, in_b = (
             _between(each, 0, counts[name]) for each in packets_of_both(name, (a, b), recorded)
         )
         compared += _first_difference(in_a.sent, in_b.sent)
         found = _sent(name, in_a, in_b)
-        if found is not None and not difference and not in_a.sent_before + in_b.sent_before:
-            difference = found.text
-    return compared, difference
+        if found is not None and not in_a.sent_before + in_b.sent_before:
+            differences.append(found)
+    if not differences:
+        return compared, ""
+    return compared, _told(min(differences, key=lambda each: each.at_ns), (a, b), recorded)
+
+
+def _told(first: _Difference, runs: tuple[PastRun, PastRun], recorded: RecordedPackets) -> str:
+    """A difference with the field in which it lies, if the runs were recorded."""
+    if first.packet is None:
+        return first.text
+    messages = [recorded.message(run.folder, *first.packet) for run in runs]
+    if None in messages:
+        return f"{first.text} (to see in which field, run both with --record)"
+    field = next(differing_fields(*messages), None)
+    return first.text + (f" in {field}" if field else " (but no recorded field does)")
 
 
 class _Comparer:
@@ -188,18 +201,11 @@ class _Comparer:
         text = None
         if self.differences:
             first = min(self.differences, key=lambda difference: difference.at_ns)
-            text = first.text
             others = len(self.differences) - 1
             if others:
                 differ = "connections differ" if others > 1 else "connection differs"
                 self._remarks.append(f"{others} more {differ}, from a later moment on")
-            if first.packet is not None:  # a bag is read for the first difference only
-                messages = [self._recorded.message(run.folder, *first.packet) for run in self._runs]
-                if None in messages:
-                    text += " (to see in which field, run both with --record)"
-                else:
-                    field = next(differing_fields(*messages), None)
-                    text += f" in {field}" if field else " (but no recorded field does)"
+            text = _told(first, self._runs, self._recorded)
         return RunComparison(
             text,
             tuple(self._remarks),

@@ -339,7 +339,12 @@ def _replayed(options: argparse.Namespace) -> int:
     else:
         for note in verdict.notes:
             print(f"note: {note}")
-        print(_in_words(verdict))
+        text = verdict.difference
+        if not text:
+            compared = _compared(verdict.packets, verdict.connections)
+            what = compared if verdict.connections else "it sends nothing"
+            text = f"{what}; {counted(verdict.hooks, 'start')} of hooks"
+        print(f"{verdict.verdict}: {text}")
     return _EXIT_CODES[verdict.verdict]
 
 
@@ -404,15 +409,6 @@ def _verdict(node: ReplayedNode, run: PastRun, name: str) -> NodeVerdict:
         difference or "",
         tuple(node.notes),
     )
-
-
-def _in_words(verdict: NodeVerdict) -> str:
-    if verdict.difference:
-        return f"{verdict.verdict}: {verdict.difference}"
-    what = "it sends nothing"
-    if verdict.connections:
-        what = _compared(verdict.packets, verdict.connections)
-    return f"{verdict.verdict}: {what}; {counted(verdict.hooks, 'start')} of hooks"
 
 
 def _compared(packets: int, connections: int) -> str:

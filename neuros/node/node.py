@@ -297,13 +297,17 @@ class NodeRuntime:
                     check(variables)
                 return
             self._contexts.change(self._context, variables)
-            self._set_parameters(parameters)
+            ros_node = self._middleware.ros_node(self.file)
+            for name, value in parameters.items():
+                kind = type(ros_node.get_parameter(name))
+                (result,) = ros_node.set_parameters([kind(name, value=value)])
+                if not result.successful:
+                    raise NodeError(f"parameter '{name}' cannot be {value!r}: {result.reason}")
             for apply, _ in self._services.changes:
                 apply()
         except BaseException as error:
-            text = "the change of a fork: "
             known = isinstance(error, NeurosError)
-            self.failures.report(error if known else as_node_error(error, text))
+            self.failures.report(error if known else as_node_error(error, "a fork changes it: "))
 
     def drain(self, last_round: Sequence[int] = ()) -> None:
         """Stop the hooks that send unasked; after a pause, the others go on.
@@ -408,15 +412,6 @@ class NodeRuntime:
         self._enter()
         if self.engine is not None:
             self.engine.note_callback()
-
-    def _set_parameters(self, parameters: Mapping[str, Any]) -> None:
-        """Raises ``NodeError`` if the plugin refuses a value."""
-        ros_node = self._middleware.ros_node(self.file)
-        for name, value in parameters.items():
-            kind = type(ros_node.get_parameter(name))
-            (result,) = ros_node.set_parameters([kind(name, value=value)])
-            if not result.successful:
-                raise NodeError(f"parameter '{name}' cannot be {value!r}: {result.reason}")
 
     def _load_plugin(self) -> None:
         node = self.file.node
