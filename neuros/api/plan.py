@@ -11,6 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from neuros.api.kept import Sources, find_sources, given_sources
 from neuros.api.request import Duration, Request
@@ -123,6 +124,7 @@ class Plan:
     Attributes:
         is_held: whether a session steps the run.
         restored: what nodes get back that their plugins have kept.
+        fork: of which run it is a fork, for the record; empty: of none.
     """
 
     project: Project
@@ -134,6 +136,12 @@ class Plan:
     messages: Messages | None = None
     is_held: bool = False
     restored: Sources = field(default_factory=dict)
+    fork: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What ``run.json`` says of the run of which this is a fork."""
+        return {"fork": dict(self.fork)} if self.fork else {}
 
     @property
     def elsewhere(self) -> tuple[str, ...]:

@@ -378,6 +378,21 @@ class Reset(Message):
     keep: Mapping[str, tuple[str, ...]] = {}
 
 
+class Change(Message):
+    """While paused, change what a node was given, and go on from there.
+
+    Attributes:
+        variables: of its environment.
+        parameters: of its ROS node.
+        only_checks: whether to check that this is possible, and to change nothing.
+    """
+
+    node: str
+    variables: Mapping[str, str]
+    parameters: Mapping[str, Any]
+    only_checks: bool = False
+
+
 class Deliver(Message):
     """A packet of a session for one of its inputs."""
 
@@ -457,10 +472,11 @@ TO_NODES: Sequence[type[Message]] = (
         Step,
         GetStatus,
     ),
-    *(Advance, Deliver, Reset),
+    *(Advance, Deliver, Reset, Change),
 )
 FROM_OBSERVERS: Sequence[type[Message]] = (
     *(Watch, GetStatus, Pause, Resume, Step, End, Interrupt, Advance, Deliver, Reset),
+    Change,
 )
 TO_OBSERVERS: Sequence[type[Message]] = (
     *(NodeStatus, PhaseChanged, LogRecord, Ended, AtRest, WasReset),

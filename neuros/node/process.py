@@ -194,6 +194,10 @@ class NodeProcess:
                     node.step(count, is_driven=is_driven)
             case control.Deliver(name, input_name, data) if name in self._nodes:
                 self._nodes[name].deliver(input_name, data)
+            case control.Change(name) if name in self._nodes:
+                self._nodes[name].change(
+                    message.variables, message.parameters, only_checks=message.only_checks
+                )
 
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""

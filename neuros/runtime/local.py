@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neuros.ports import Inbox, Logger, NodeEvents, Transport, TransportKind, Voice
@@ -373,6 +373,14 @@ class LocalRosNode:
         if name not in self._given:
             self._parameters[name] = value
         return self.get_parameter(name)
+
+    def set_parameters(self, parameters: Sequence[Any]) -> Sequence[Any]:
+        """Set parameters that are declared, as in rclpy."""
+        if not self._real and all(each.name in self._parameters for each in parameters):
+            self._parameters |= {each.name: each.value for each in parameters}
+            return [SimpleNamespace(successful=True, reason="") for _ in parameters]
+        results: Sequence[Any] = self.__getattr__("set_parameters")(parameters)
+        return results
 
     def __getattr__(self, attribute: str) -> Any:
         if attribute.startswith("__"):  # copy and pickle look for such attributes

@@ -48,7 +48,7 @@ from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
 from neuros.recording.recorder import Recorder
-from neuros.replay.recorded_node import RecordedNode, recorded_node
+from neuros.replay.recorded_node import RecordedNode, recorded_node, recorded_run
 from neuros.transport.codecs import WrongBytes, message_codec
 from neuros.transport.large_packets import LargeInput, LargeOutput
 from neuros.transport.message_buffers import message_buffers
@@ -325,8 +325,11 @@ def review(run: Path, data: bytes) -> None:
 def replay(run: Path) -> None:
     """Read the nodes of a run as ``replay`` does."""
     with allowed(NeurosError):
+        recorded = recorded_run(run)
         for name in ("a", "b"):
-            Script(RecordedNode(*recorded_node(run, name)).event_log)
+            node = RecordedNode(recorded, recorded_node(recorded, name))
+            node.check()
+            Script(node.event_log)
 
 
 @contextlib.contextmanager

@@ -45,6 +45,7 @@ BY_NAME = {
         "api/test_local_sessions.py",
         "api/test_python_api.py",
         "api/test_reset_settings.py",
+        "api/test_session_forks.py",
         "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
         "extensions/neuros-analysis/tests/test_report.py",

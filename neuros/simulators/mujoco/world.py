@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping, MutableSet, Sequence
@@ -136,7 +137,7 @@ class World(Declared):
         self.steps = 0
         self._seen_warnings: set[int] = set()
         self._fields = ModelFields(self.where)
-        self._fields.apply(self.model, self.data)
+        self._fields.apply(self.model)
         mujoco.mj_resetData(self.model, self.data)
         forward(self.model, self.data)
 
@@ -193,10 +194,19 @@ class World(Declared):
 
     def reset(self) -> None:
         """Back to time zero and the model's initial state; spawned entities stay."""
-        self._fields.apply(self.model, self.data)
+        self._fields.apply(self.model)
         mujoco.mj_resetData(self.model, self.data)
         forward(self.model, self.data)
         self.steps = 0
+
+    def check_fields(self, variables: Mapping[str, str]) -> None:
+        """Check the fields of the model that a fork will change. Raises ``ModelError``."""
+        self._fields.check(self.model, variables)
+
+    def change_fields(self) -> None:
+        """Change fields of the model as the environment has them now; the state stays."""
+        if self._fields.apply(self.model):
+            forward(self.model, self.data)
 
     def spawn(self, path: str, position: Sequence[float], name: str) -> None:
         """Attach the model of a file to the world; everything else keeps its state."""
@@ -327,19 +337,32 @@ class ModelFields:
         self._where = where
         self._before: dict[str, Any] = {}
 
-    def apply(self, model: Any, data: Any) -> None:
+    def check(self, model: Any, variables: Mapping[str, str]) -> None:
+        """Check that the fields in an environment can be changed. Raises ``ModelError``."""
+        if MODEL_FIELDS in variables:
+            ModelFields(self._where).apply(copy.copy(model), variables[MODEL_FIELDS])
+
+    def apply(self, model: Any, text: str | None = None) -> bool:
         """Give the fields of before their values back, then change those of now.
+
+        Args:
+            text: those of now, as JSON; ``None``: as the environment has them.
+
+        Returns:
+            Whether something may have changed.
 
         Raises:
             ModelError: if the model has no such field, or it has another shape.
         """
-        fields = json.loads(os.environ.get(MODEL_FIELDS) or "{}")
+        fields = json.loads((os.environ.get(MODEL_FIELDS) if text is None else text) or "{}")
         if not (fields or self._before):
-            return
+            return False
         for name, value in self._before.items():
             self._set(model, name, value)
         self._before = {name: self._set(model, name, value) for name, value in fields.items()}
-        mujoco.mj_setConst(model, data)  # what MuJoCo has derived from them
+        # What MuJoCo has derived from them; it computes that in the data that it is given.
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        return True
 
     def _set(self, model: Any, name: str, value: Any) -> Any:
         """Change a field; returns its value of before."""
