@@ -33,8 +33,8 @@ _LEFT_OUT = control.GetStatus, control.NodeStatus, control.LogRecord
 _READS_AT_A_TIME = 64
 _WAKING_BYTES = 1024
 
-_FIRST_LOOK_S = 0.0005
-_RAREST_LOOK_S = 0.02
+_FIRST_CHECK_S = 0.0005
+_RAREST_CHECK_S = 0.02
 _LOST_AFTER_S = 0.1
 """On a connection that may lose packets, one that has not arrived for so long has been lost."""
 _NEVER_S = 3600.0
@@ -308,7 +308,7 @@ class Observers:
         for link in self._links.values():
             self._channels.send_to(link, message)
 
-    def look_at(self, phase: Phase) -> None:
+    def update(self, phase: Phase) -> None:
         """Ask nodes what they want to see, tell them of a change of phase; end a lonely pause.
 
         One that has asked several times since is answered once.
@@ -346,7 +346,7 @@ Counts: TypeAlias = Mapping[str, tuple[int, int]]
 """By connection, packets that have passed, and those acknowledged; -1: none ever are."""
 
 
-class Settling:
+class RestDetector:
     """Answers ``advance`` of a session: once all nodes are active, and nothing moves.
 
     The run is paused: this is the end of a step. Each node process answers when no event waits in
@@ -379,7 +379,7 @@ class Settling:
 
     @property
     def wait_s(self) -> float:
-        """Seconds until :meth:`look` has something to do."""
+        """Seconds until :meth:`check` has something to do."""
         return _NEVER_S if self._due_s is None else max(0.0, self._due_s - self._clock())
 
     def ask(self, asker: ControlLink, message: control.Advance) -> None:
@@ -405,7 +405,7 @@ class Settling:
         if {name for names in self._answers for name in names} == self._names:
             self._judge(self._asker)
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Ask again where it is time."""
         if self._due_s is not None and self._clock() >= self._due_s:
             self._begin_round()
@@ -421,7 +421,7 @@ class Settling:
         self._channels.send(control.Advance(self._round, 0, {**self._asked.known, **known}))
 
     def _ask_later(self) -> None:
-        self._pause_s = min(max(2 * self._pause_s, _FIRST_LOOK_S), _RAREST_LOOK_S)
+        self._pause_s = min(max(2 * self._pause_s, _FIRST_CHECK_S), _RAREST_CHECK_S)
         self._due_s = self._clock() + self._pause_s
 
     def _judge(self, asker: ControlLink) -> None:

@@ -139,7 +139,7 @@ class Outcome:
             self.timelines.setdefault(name, []).extend(report.timeline)
             self.report_times_s[name] = now_s
 
-    def excuse(self, still_s: float) -> None:
+    def shift(self, still_s: float) -> None:
         """The launcher stood still for so long, and perhaps the nodes: their reports are as new."""
         self.report_times_s = {n: at_s + still_s for n, at_s in self.report_times_s.items()}
 

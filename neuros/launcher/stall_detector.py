@@ -123,7 +123,7 @@ class StallDetector:
         self._has_explained = False
         self._starving.clear()
 
-    def excuse(self, still_s: float) -> None:
+    def shift(self, still_s: float) -> None:
         """Nobody could be heard for so long: that is no silence and no standstill of a node."""
         self._heard_s = {name: heard_s + still_s for name, heard_s in self._heard_s.items()}
         self._moved_s += still_s

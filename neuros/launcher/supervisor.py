@@ -23,7 +23,7 @@ import neuros.control as control
 from neuros.control import Message, Report
 from neuros.control.link import ControlLink
 from neuros.errors import ControlError
-from neuros.launcher.channels import Channels, Observers, PauseState, Settling
+from neuros.launcher.channels import Channels, Observers, PauseState, RestDetector
 from neuros.launcher.finalising import LEAVE_S, FinaliseTimes
 from neuros.launcher.outcome import (
     EXIT_CODES,
@@ -147,7 +147,7 @@ class Supervisor:
         self._declarations = Declarations(files)
         limits_s = {file.node.name: finalise_s or file.node.finalise_s for file in files}
         self._finalising = FinaliseTimes(limits_s, run_folder)
-        self._settling = Settling(self._names, self._channels)
+        self._rest_detector = RestDetector(self._names, self._channels)
         self.pause = PauseState(self._channels.send, time.monotonic)
         if is_held:
             self.pause.begin()
@@ -191,13 +191,13 @@ class Supervisor:
             has_shown = True
             self._last_tick_s = time.monotonic()
             while self._processes and not self._is_hopeless:
-                self._channels.wait(min(self._pause_s(has_shown), self._settling.wait_s))
+                self._channels.wait(min(self._pause_s(has_shown), self._rest_detector.wait_s))
                 self._handle_signals()
                 self._handle_wishes()
                 self._receive()
                 self._check_processes()
                 self._tick()
-                self._settling.look()
+                self._rest_detector.check()
                 self._channels.flush()
                 has_shown = bool(self._output.poll())
         finally:
@@ -307,12 +307,12 @@ class Supervisor:
                 self._peers.receive(node, text, now_s)
             case control.Advance():
                 self.pause.step(message.rounds, is_driven=self._detector.is_driven)
-                self._settling.ask(link, message)
+                self._rest_detector.ask(link, message)
             case control.AtRest():
                 if self.phase in _BEFORE_END:  # else the session hears of the end
-                    self._settling.add(message)
+                    self._rest_detector.add(message)
             case control.Resume():
-                self._settling.give_up(link)
+                self._rest_detector.give_up(link)
                 self.observers.receive(link, message)
             case control.Interrupt():
                 self._signals.append(signal.SIGINT)
@@ -397,11 +397,11 @@ class Supervisor:
         now_s = time.monotonic()
         still_s, self._last_tick_s = now_s - self._last_tick_s, now_s
         if still_s > _KEPT_STILL_S:  # then the nodes may have been stopped, too
-            self._detector.excuse(still_s)
+            self._detector.shift(still_s)
             self._backlog.begin_anew()
             self._deadline_s += still_s
-            self._finalising.excuse(still_s)
-            self.outcome.excuse(still_s)
+            self._finalising.shift(still_s)
+            self.outcome.shift(still_s)
         if end := self._peers.end(now_s):
             self._handle(RunEvent.ENDED_ELSEWHERE, end)
         self._handle(RunEvent.TICK, now_s)
@@ -410,7 +410,7 @@ class Supervisor:
         if self.phase in _BEFORE_STOP:
             self._show(self._detector.remarks_on_silence(now_s, self._processes.killed))
         # To observers, a run that starts is running.
-        self.observers.look_at(Phase.RUNNING if self.phase is Phase.STARTING else self.phase)
+        self.observers.update(Phase.RUNNING if self.phase is Phase.STARTING else self.phase)
 
     def _keep_pause(self) -> None:
         """Keep how long the run has stood still; nodes that are stopped meanwhile do not go on."""
@@ -472,7 +472,7 @@ class Supervisor:
             self._fail(overdue, exit_code=4)
         if self._peers.exist or not self._detector.is_complete:  # then not all can be asked
             return
-        if self._probing.look(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:
+        if self._probing.check(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:
             self._fail(self._probing.why_dead())
 
     # ------------------------------------------------------------------ draining
@@ -498,7 +498,7 @@ class Supervisor:
         self._probing.drain(self._processes.killed, now_s)
 
     def _tick_draining(self, now_s: float) -> None:
-        if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
+        if self._probing.check(now_s, 0.0) is Verdict.DRAINED:
             if self._stops_hooks_first:
                 self._stops_hooks_first = False
                 self._channels.send(control.StopHooks())

@@ -126,7 +126,7 @@ class Keeping:
             self._functions.clear()
         self._earlier = {*self._functions}
 
-    def settle(self) -> None:
+    def restore_waiting(self) -> None:
         """All initialise hooks have run: put what waits, by functions of an earlier life.
 
         Raises:
