@@ -91,6 +91,9 @@ class HeldRun(Protocol):
     def copy(self, type_name: str, content: Any) -> Any:
         """A packet of its own for the program, from the content that came with an answer."""
 
+    def view(self, type_name: str, content: Any) -> Any:
+        """The packet of such a content, which nobody may change."""
+
     def size_of(self, content: Any) -> int:
         """The bytes of the content of a packet."""
 
@@ -193,6 +196,8 @@ class LaunchedRun:
 
     def copy(self, type_name: str, content: bytes) -> Any:
         return self._packets.decode(type_name, content)
+
+    view = copy
 
     def size_of(self, content: bytes) -> int:
         return len(content)

@@ -296,7 +296,8 @@ class Supervisor:
                     self._log("INFO", f"{node}: {text}")
             case control.Shutdown(node, reason, drain_s):
                 because = f": {reason}" if reason else ""
-                self._handle(RunEvent.END, f"{node} ended the project{because}", drain_s, node)
+                why = f"{node} ended the project{because}" if node else reason
+                self._handle(RunEvent.END, why, drain_s, node)
             case control.Failed(node, text):
                 # Of a run that ends well, the failure of a node that was killed does not matter.
                 if self.outcome.failures or node not in self._processes.killed:

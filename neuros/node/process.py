@@ -15,6 +15,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
+from typing import cast
 
 import neuros.control as control
 from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Advance, Message
@@ -28,14 +29,16 @@ from neuros.node.node import NodeRuntime
 from neuros.node.peer_link import PeerLink
 from neuros.node.reports import declared
 from neuros.node.saving import Saving
-from neuros.ports import ControlStream, Middleware, PacketRecorder
+from neuros.ports import ControlStream, Middleware, PacketRecorder, VirtualRun
 from neuros.project.model import Connection, NodeFile
+from neuros.project.timing import VIRTUAL
 from neuros.stacks import allow_reading
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
 Event = Callable[[], None]
 
 _REPORT_S = 1.0
+_DRAIN_S = 5.0
 
 
 class ProcessStage(IntEnum):
@@ -56,6 +59,8 @@ class NodeProcess:
         connect: connects to the supervisor; the current folder is the run folder by then.
         open_recorder: where a node puts what is recorded; ``None``: nothing is.
         duration_sim_s: simulated time after which the node that owns it ends the project.
+        duration_s: virtual time after which the project ends.
+        real_time_factor: seconds of virtual time per second of the machine, at most.
         is_held: whether nodes stand still from the start, for a session.
         own_logs: whether each node writes to a log file of its own (several nodes share the
             process), rather than to the output that the process was started with.
@@ -69,10 +74,14 @@ class NodeProcess:
         *,
         open_recorder: Callable[[NodeFile], PacketRecorder] | None = None,
         duration_sim_s: float | None = None,
+        duration_s: float | None = None,
+        real_time_factor: float | None = None,
         is_held: bool = False,
         own_logs: bool = False,
     ) -> None:
         self._files = files
+        self._duration_s = duration_s
+        self._real_time_factor = real_time_factor
         self._make_middleware = make_middleware
         self._connect = connect
         self._open_recorder = open_recorder
@@ -266,6 +275,7 @@ class NodeProcess:
         assert self._middleware is not None
         if not (why_not := self._why_not_reset()):
             self._has_been_reset = True
+            self._middleware.begin_anew(self._files, asked.variables)
             for node in self._nodes.values():
                 try:
                     node.reset(asked.variables.get(node.name, {}), asked.keep.get(node.name, ()))
@@ -298,6 +308,9 @@ class NodeProcess:
         gc.disable()
         try:
             middleware = self._make_middleware(self._files, self._fail_outside_hooks)
+            if self._files[0].time == VIRTUAL:
+                loop = cast(VirtualRun, middleware.loop)
+                loop.plan(self._duration_s, self._end_by_duration, self._real_time_factor)
             with self._early_lock:
                 self._middleware = middleware
                 for event in self._early_events:
@@ -330,6 +343,10 @@ class NodeProcess:
         self.report()
         for node in self._nodes.values():
             node.start(awaits_others=True)
+
+    def _end_by_duration(self) -> None:
+        reason = f"{self._duration_s:g} s of virtual time have passed"
+        self._tell(control.Shutdown("", reason, _DRAIN_S))
 
     @property
     def is_ending(self) -> bool:
