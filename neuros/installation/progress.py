@@ -64,11 +64,8 @@ def run_logged(
 ) -> int:
     """Run a program, append its output to a log, and show each line; returns its exit code.
 
-    Args:
-        given: its standard input.
-
-    Raises:
-        OSError: if it cannot be started, or the log cannot be written.
+    ``given`` is its standard input. Raises ``OSError``: if it cannot be started, or the log not
+    written.
     """
     with (
         log.open("a", encoding="utf-8") as file,

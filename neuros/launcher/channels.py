@@ -171,28 +171,25 @@ class Channels:
                 yield link, error
                 return
             for data in found or ():
-                yield link, self._message_in(data, link)
+                try:
+                    message = link.decode(data)
+                except ControlError as error:
+                    yield link, error
+                    continue
+                if isinstance(message, control.Hello):
+                    self._nodes[link] = tuple(message.nodes)
+                    link.accept(control.FROM_NODES)
+                    link.peer = f"the process of {' and '.join(message.nodes)}"
+                elif isinstance(message, control.Watch):
+                    link.accept(control.FROM_OBSERVERS)
+                    link.peer = "an observer"
+                yield link, message
             if found is None:
                 if link in self._nodes:
                     self.parted[self._nodes[link]] = time.monotonic()
                 self.hang_up(link)
             if link not in self._nodes:
                 return
-
-    def _message_in(self, data: bytes, link: ControlLink) -> Message | ControlError:
-        """The message, after which it is known who is at the other end; else why there is none."""
-        try:
-            message = link.decode(data)
-        except ControlError as error:
-            return error
-        if isinstance(message, control.Hello):
-            self._nodes[link] = tuple(message.nodes)
-            link.accept(control.FROM_NODES)
-            link.peer = f"the process of {' and '.join(message.nodes)}"
-        elif isinstance(message, control.Watch):
-            link.accept(control.FROM_OBSERVERS)
-            link.peer = "an observer"
-        return message
 
 
 @dataclass

@@ -242,11 +242,6 @@ class Processes:
         """The process with a node, if it runs."""
         return next((each for each in self._running if name in each.names), None)
 
-    def have_reported(self) -> bool:
-        """Whether every node has made its final report, but for those that were killed."""
-        names = {name for process in self._running for name in process.names}
-        return all(map(self._outcome.has_final_report, names - self.killed))
-
     def may_end(self, process: RunningNode, *, is_stopping: bool) -> bool:
         """Whether it was asked to end and has told its last, or has failed and said so."""
         names = set(process.names)

@@ -185,15 +185,14 @@ class Supervisor:
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
         try:
-            self._handle_signals()  # one may have come before anything was started
+            self._handle_requests()  # one may have come before anything was started
             if self.phase is Phase.STARTING:
                 self._processes.add(self._launcher.start(self._files, self._environment))
             has_shown = True
             self._last_tick_s = time.monotonic()
             while self._processes and not self._is_hopeless:
                 self._channels.wait(min(self._pause_s(has_shown), self._rest_detector.wait_s))
-                self._handle_signals()
-                self._handle_wishes()
+                self._handle_requests()
                 self._receive()
                 self._check_processes()
                 self._tick()
@@ -230,12 +229,10 @@ class Supervisor:
 
     # ------------------------------------------------------------------ what arrives
 
-    def _handle_signals(self) -> None:
+    def _handle_requests(self) -> None:
+        """End as the user wishes, or the program that has started the run."""
         while self._signals:
             self._handle(RunEvent.SIGNAL, signal.Signals(self._signals.pop(0)))
-
-    def _handle_wishes(self) -> None:
-        """End as the program that has started the run wishes."""
         while self._wishes:
             reason, exit_code = self._wishes.pop(0)
             if not exit_code:
@@ -406,21 +403,16 @@ class Supervisor:
         if end := self._peers.end(now_s):
             self._handle(RunEvent.ENDED_ELSEWHERE, end)
         self._handle(RunEvent.TICK, now_s)
-        self._keep_pause()
+        self.outcome.is_paused = self.pause.is_on
+        if self.outcome.started_s is not None:
+            self.outcome.paused_s = self.pause.total_s - self._paused_before_s
+        if self.phase is Phase.STOPPING and self.pause.is_on:  # nodes do not go on before they end
+            self.outcome.ending_s = self.pause.since_s
         self._show(self._detector.remarks_on_hooks())
         if self.phase in _BEFORE_STOP:
             self._show(self._detector.remarks_on_silence(now_s, self._processes.killed))
         # To observers, a run that starts is running.
         self.observers.update(Phase.RUNNING if self.phase is Phase.STARTING else self.phase)
-
-    def _keep_pause(self) -> None:
-        """Keep how long the run has stood still; nodes that are stopped meanwhile do not go on."""
-        outcome = self.outcome
-        outcome.is_paused = self.pause.is_on
-        if outcome.started_s is not None:
-            outcome.paused_s = self.pause.total_s - self._paused_before_s
-        if self.phase is Phase.STOPPING and outcome.is_paused:
-            outcome.ending_s = self.pause.since_s
 
     def _show(self, remarks: Iterable[tuple[str, str]]) -> None:
         for severity, text in remarks:
