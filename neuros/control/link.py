@@ -243,7 +243,7 @@ def decode(data: bytes, decoder: msgspec.msgpack.Decoder[Message], peer: str) ->
 
 
 def read_as(declared: type[_Declared], content: Any) -> _Declared:
-    """An object of a class from JSON that somebody else has written.
+    """An object of a class from the JSON of another program.
 
     Raises:
         ControlError: if a field is missing or of a wrong type.

@@ -28,7 +28,7 @@ class Progress:
         self._start = self._last = time.monotonic()
 
     def step(self, text: str) -> None:
-        """Say what happens now."""
+        """Show a step that begins."""
         self._last = time.monotonic()
         self._write(f"{self._line(text)}\n")
 
@@ -41,7 +41,7 @@ class Progress:
             self.step(f"  {text}")
 
     def fail(self, text: str) -> None:
-        """Say what ended it."""
+        """Show the error that ended the work."""
         self._write(f"{text}\n")
 
     def _line(self, text: str) -> str:

@@ -61,7 +61,7 @@ class Channels:
         self._waker: socket.socket | None = None
 
     def wake_on(self, waker: socket.socket) -> None:
-        """Let :meth:`wait` return, too, when bytes arrive here; they mean nothing by themselves."""
+        """Have :meth:`wait` return when bytes arrive on ``waker``, too; they are dropped."""
         waker.setblocking(False)
         self._waker = waker
         self._selector.register(waker, selectors.EVENT_READ)
@@ -141,7 +141,7 @@ class Channels:
             link.flush()
 
     def hang_up(self, link: ControlLink) -> None:
-        """Neither send to this one nor hear it any more."""
+        """Close the connection."""
         if link in self._links:
             del self._links[link]
             self._selector.unregister(link)
@@ -159,7 +159,7 @@ class Channels:
         return {key.fileobj for key, _ in self._selector.select(timeout_s)}
 
     def _read(self, link: ControlLink) -> Iterator[tuple[ControlLink, Message | ControlError]]:
-        """All that a node process has said; of any other program, what comes first."""
+        """All messages of a node process; of another program, those of one read."""
         for _ in range(_READS_AT_A_TIME):
             if link not in self._links:
                 return
@@ -218,13 +218,13 @@ class PauseState:
         return self._before_s + (0.0 if self.since_s is None else self.clock() - self.since_s)
 
     def begin(self) -> None:
-        """Let no hook start."""
+        """Pause all nodes."""
         if self.since_s is None:
             self.since_s = self.clock()
             self.send(control.Pause())
 
     def end(self) -> None:
-        """Let the run go on."""
+        """Resume all nodes."""
         if self.since_s is not None:
             self.forget()
             self.send(control.Resume())
@@ -234,7 +234,7 @@ class PauseState:
         self._before_s, self.since_s = self.total_s, None
 
     def step(self, count: int, *, is_driven: bool) -> None:
-        """Let a paused run do so many steps."""
+        """Run ``count`` steps of a paused run."""
         if self.since_s is not None and count > 0:
             self.send(control.Step(count, is_driven))
 
@@ -306,9 +306,10 @@ class Observers:
             self._channels.send_to(link, message)
 
     def update(self, phase: Phase) -> None:
-        """Ask nodes what they want to see, tell them of a change of phase; end a lonely pause.
+        """Ask nodes for the statuses that observers want, and send these a change of phase.
 
-        One that has asked several times since is answered once.
+        An observer that has asked several times since is answered once. When the last observer has
+        gone, a paused run goes on.
         """
         for number, wanted in self._asked.items():
             self._channels.send(control.GetStatus(wanted, number))
@@ -325,8 +326,8 @@ class Observers:
             self._told = now
             self.tell(now)
 
-    def part(self, outcome: Outcome) -> None:
-        """Tell them how the run has ended."""
+    def end(self, outcome: Outcome) -> None:
+        """Send observers the end of the run."""
         self.tell(
             control.Ended(
                 outcome.exit_code,
@@ -387,7 +388,7 @@ class RestDetector:
         self._begin_round()
 
     def give_up(self, asker: ControlLink) -> None:
-        """This one lets the run go on, and waits for no answer any more."""
+        """This session resumes the run, and waits for no answer any more."""
         if asker is self._asker:
             self._asker = self._due_s = None
 

@@ -41,7 +41,7 @@ class FinaliseTimes:
         self._left[node] = list(hooks)
 
     def begin(self, now_s: float) -> None:
-        """The nodes have been told to end."""
+        """The nodes have been asked to end."""
         for name in self.limits_s:
             self._moved_s.setdefault(name, now_s)
             self._looked_s.setdefault(name, now_s)  # what nodes write as they are told is no news
@@ -93,7 +93,7 @@ class FinaliseTimes:
         return clauses
 
     def remarks(self, now_s: float) -> Iterator[str]:
-        """What takes long now, each once."""
+        """Sentences about nodes that have finalised for a second, each once."""
         for node, hook in self._hooks.items():
             is_long = hook is not None and now_s - self._since_s[node] >= SAVING_S
             if hook is not None and is_long and (node, hook) not in self._named:

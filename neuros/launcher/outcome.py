@@ -184,7 +184,7 @@ class Outcome:
 def _advance(
     timeline: Sequence[Sequence[float]], start_s: float, end: tuple[float, float]
 ) -> float:
-    """The simulated time that has passed since a wall time; what a reset takes back has passed."""
+    """The simulated seconds since a wall time; a reset takes none of them back."""
     after = bisect_right(timeline, start_s, key=lambda point: point[1])
     points = [(_simulated(timeline, start_s), start_s), *timeline[after:], end]
     return sum(max(0.0, later[0] - earlier[0]) for earlier, later in pairwise(points))
@@ -243,7 +243,7 @@ class Processes:
         return next((each for each in self._running if name in each.names), None)
 
     def may_end(self, process: RunningNode, *, is_stopping: bool) -> bool:
-        """Whether it was asked to end and has told its last, or has failed and said so."""
+        """Whether its nodes have made their final reports, or have reported a failure."""
         names = set(process.names)
         if names <= self.killed or names & self.failed:
             return True

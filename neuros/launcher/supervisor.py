@@ -205,7 +205,7 @@ class Supervisor:
                 process.kill()
             self._reader.close()
             self._receive()
-            self.observers.part(self.outcome)
+            self.observers.end(self.outcome)
             self._channels.close()
             self.outcome.elsewhere = self._peers.counters()
             self.outcome.ended_s = time.monotonic()
@@ -223,7 +223,7 @@ class Supervisor:
         self._handle(RunEvent.FAILURE)
 
     def _log(self, severity: str, text: str) -> None:
-        """Tell the user and the observers."""
+        """Log for the user and the observers."""
         self._output.log(severity, text)
         self.observers.tell(control.LogRecord(severity, text))
 
@@ -343,14 +343,14 @@ class Supervisor:
                 )
 
     def _is_cut_off(self, process: RunningNode) -> bool:
-        """Whether a process goes on, though it has hung up and has not told its last."""
+        """Whether a process runs on without its control connection, before its final reports."""
         for names, since_s in self._channels.parted.items():
             if {*names} & {*process.names} and time.monotonic() - since_s > _PARTED_S:
                 return not self._processes.may_end(process, is_stopping=True)
         return False
 
     def _kill(self, processes: Sequence[RunningNode]) -> None:
-        """Kill processes, and tell where their nodes stood."""
+        """Kill processes, and log where their nodes stood."""
         self._begin_to_read(processes)
         self._reader.wait(_READ_S)
         now_s = time.monotonic()
@@ -476,7 +476,7 @@ class Supervisor:
             self._log("INFO", f"{reason}; the end comes once every node has initialised")
 
     def _drain(self, reason: str, drain_s: float = _DRAIN_S, stopped: str = "") -> None:
-        """Let packets under way arrive, and then end.
+        """Drain: wait until packets under way have arrived, then end.
 
         ``stopped`` is the node that asks for it, and starts no further hook.
         """

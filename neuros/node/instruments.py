@@ -49,7 +49,7 @@ class Instrument(Protocol):
     """Watches packets of a node."""
 
     def attach(self, passage: Passage) -> None:
-        """Add what looks at the packets of a passage, at once or for as long as it is asked for."""
+        """Add observers to a passage, at once or while they are asked for."""
 
 
 _MOST_PACKETS = 1000

@@ -310,7 +310,7 @@ class NodeRuntime:
         self._guard(self._loaded.resume)
 
     def step(self, count: int, *, is_driven: bool) -> None:
-        """While paused, let the hooks that drive the project start so many times more."""
+        """While paused, let each hook that drives the project start ``count`` times."""
         engine = self.engine
         assert engine is not None
         try:
@@ -535,7 +535,7 @@ class NodeEffects:
         self._on_initialised = on_initialised
 
     def passage(self, way: Way, port: Port, connection: Connection | None = None) -> Passage:
-        """A place where packets pass, with the instruments that want to look at them."""
+        """A place where packets pass, with the observers of all instruments."""
         passage = Passage(way, port, connection)
         for instrument in self._instruments:
             instrument.attach(passage)

@@ -82,7 +82,7 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
 
 
 def no_module(name: str) -> PluginError:
-    """What to say where a plugin is a module that this Python does not have."""
+    """The error for a plugin that is a module which this Python lacks."""
     return PluginError(
         f"there is no module {name} for {sys.executable}: its package goes into the"
         " requirements.txt of the node's container: docs/plugins.md"

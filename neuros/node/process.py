@@ -265,7 +265,7 @@ class NodeProcess:
             action()
 
     def _answer_at_rest(self) -> None:
-        """Answer the last ``advance``; where the run goes on meanwhile, none is answered."""
+        """Answer the last ``advance``, unless the run was resumed meanwhile."""
         asked, self._asked = self._asked, None
         if asked is not None and not self.is_ending:
             self._tell(_at_rest(self._nodes, asked))

@@ -58,7 +58,7 @@ class _Request:
         return has_values and is_gathered and not self._wants_all and not self._wants_image
 
     def sample(self, packet: Any) -> None:
-        """Take from a packet what is wanted; what cannot be taken is no fault of the node's."""
+        """Sample a packet; what cannot be read of it is no fault of the node's."""
         try:
             if self._paths and len(self._values) < MOST_VALUES:
                 values = [number_at(packet, path) for path in self._paths]
@@ -111,7 +111,7 @@ class _ArrayMessage:
 
 
 class Sampler:
-    """Looks at packets for observers.
+    """Samples packets for observers.
 
     Attributes:
         requests: by port (an output's name, or the topic of an external input), what is wanted by
@@ -126,7 +126,7 @@ class Sampler:
         self._passages: list[tuple[str, Passage, Observe]] = []
 
     def attach(self, passage: Passage) -> None:
-        """Look at the packets there while they are asked for."""
+        """Sample the packets of a passage while an observer asks for them."""
         if passage.way is not Way.RECEIVED:
             port = passage.port.external_topic if passage.way is Way.HEARD else passage.port.name
             name, is_array = str(port), passage.port.array is not None
@@ -351,11 +351,11 @@ class SpikeBatch:
 
     @property
     def is_full(self) -> bool:
-        """Whether no further packet is looked at, so that a page that was left costs nothing."""
+        """Whether no further packet is read, so that a page that nobody reads costs nothing."""
         return self._packets >= MOST_PACKETS or self._count > 2 * MOST_SPIKES
 
     def add(self, packet: Any) -> None:
-        """Take the spikes of a packet.
+        """Add the spikes of a packet.
 
         Raises:
             ValueError: if senders and times are not of one length.
@@ -404,11 +404,11 @@ class ArrayBatch:
 
     @property
     def is_full(self) -> bool:
-        """Whether no further packet is looked at."""
+        """Whether no further packet is read."""
         return self._packets >= MOST_ARRAYS
 
     def add(self, packet: Any) -> None:
-        """Take the array of a packet.
+        """Add the array of a packet.
 
         Raises:
             AttributeError, LookupError, TypeError, ValueError: if there is no array of numbers.

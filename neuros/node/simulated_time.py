@@ -81,12 +81,12 @@ class SimulatedTime:
         self._timeline = Timeline()
 
     def own(self, read_s: Callable[[], float]) -> None:
-        """Take it from a simulator, rather than from a clock that the node publishes."""
+        """Read the time from a simulator, not from a clock that the node publishes."""
         self._read_s = read_s
         self._is_owned = True
 
     def attach(self, passage: Passage) -> None:
-        """Take the time of clocks that are published there."""
+        """Read the time from clocks that the node publishes."""
         if passage.way is Way.SENT and passage.port.type == CLOCK_TYPE:
             passage.add(self._on_clock)
 
@@ -128,7 +128,7 @@ class SimulatedTime:
 
 
 class Timeline:
-    """Collects points of simulated and wall time until they are taken. Any thread.
+    """Collects points of simulated and wall time until :meth:`pop`. Any thread.
 
     Two threads that note one second at one moment may leave it there twice.
     """

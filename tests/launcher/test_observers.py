@@ -86,7 +86,7 @@ def test_an_observer_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
     run.observers.update(Phase.RUNNING)
     run.observers.update(Phase.RUNNING)
     run.observers.update(Phase.DRAINING)
-    run.observers.part(Outcome(3, "why"))
+    run.observers.end(Outcome(3, "why"))
     assert told(lines, 3) == [
         PhaseChanged("running", False),
         PhaseChanged("draining", False),
