@@ -452,9 +452,9 @@ def make_environments(pythons: Pythons, messages: Messages | None, output: Strea
     Raises:
         EnvironmentFault: with all failures.
     """
-    pythons.note_use()
+    pythons.record_use()
     if messages is not None:
-        messages.note_use()
+        messages.record_use()
     if are_made(pythons, messages):
         return
     # The reaper ends pip, the compiler, and their children when the launcher is killed.

@@ -274,7 +274,7 @@ class AtRest(Message):
 
 
 class WasReset(Message):
-    """Answer to ``reset``; ``why_not``: why the nodes go on as they are, empty if they do not."""
+    """Answer to ``reset``; ``why_not``: why it was refused, empty if it was not."""
 
     why_not: str
 

@@ -115,7 +115,7 @@ class PluginServices:
         """Simulated time has gone on in another thread; returns whether it is not over."""
         is_over = self.time.is_over
         if is_over:
-            self._loop.post_from_thread(lambda: self._failures.guard(self.time.look))
+            self._loop.post_from_thread(lambda: self._failures.guard(self.time.update))
         return not is_over
 
     def fail_from_thread(self, error: BaseException) -> None:
@@ -138,7 +138,7 @@ class PluginServices:
             self.waiting_threads.add(thread)
             withdrawals.append(self.engine.offer(packets, accept))
             if self.time.is_watched:
-                self.time.look()
+                self.time.update()
 
         def withdraw(done: Callable[[], None]) -> None:
             def event() -> None:

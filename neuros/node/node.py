@@ -22,7 +22,7 @@ from neuros.hooks import HookKind, HookSpec, hook_specs_of
 from neuros.node.context import Context, ContextSwitch
 from neuros.node.failures import Failures, as_node_error
 from neuros.node.handle import NodeHandle, PluginServices, Results
-from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Tap
+from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Passage
 from neuros.node.keeping import Keeping
 from neuros.node.logs import WorldLog
 from neuros.node.plugin import describe, last_line, load_plugin
@@ -178,14 +178,14 @@ class NodeRuntime:
             *(file, middleware, self._transport, self._time, sampler, clock),
             *(self._recorder, world_log, lambda: self.keeping.names),
         )
-        node, tap = file.node, self._effects.tap
+        node, passage = file.node, self._effects.passage
         arrivals = {
-            c: tap(Way.RECEIVED, node.input(c.destination_input), c)
+            c: passage(Way.RECEIVED, node.input(c.destination_input), c)
             for c in file.connections
             if c.destination_node == self.name != c.source_node
         }
         self._arrivals = {c: each for c, each in arrivals.items() if each.observers}
-        self._heard = {p.name: tap(Way.HEARD, p) for p in node.inputs if p.external_topic}
+        self._heard = {p.name: passage(Way.HEARD, p) for p in node.inputs if p.external_topic}
 
     @property
     def run_dir(self) -> Path:
@@ -362,7 +362,7 @@ class NodeRuntime:
         self._guard(self._loaded.resume)
 
     def step(self, count: int, *, is_driven: bool) -> None:
-        """While paused, let the hooks that drive the project start so many times more."""
+        """While paused, let each hook that drives the project start ``count`` times."""
         engine = self.engine
         assert engine is not None
         try:
@@ -394,8 +394,8 @@ class NodeRuntime:
 
     def on_packet(self, connection: Connection, packet: Any) -> None:
         """A packet has arrived on a connection."""
-        if self._arrivals and (tap := self._arrivals.get(connection)) is not None:
-            for observe in tap.observers:
+        if self._arrivals and (passage := self._arrivals.get(connection)) is not None:
+            for observe in passage.observers:
                 observe(packet, None)
         engine = self.engine
         assert engine is not None
@@ -507,7 +507,7 @@ class NodeRuntime:
     def _restore(self) -> None:
         """Put what waits into values that were kept, once all initialise hooks have run."""
         if not self._uninitialised:
-            self.keeping.settle()
+            self.keeping.restore_waiting()
 
     def _save_packets(self) -> None:
         """Leave the newest packets for a session, which may want to see what led to the end."""
@@ -587,18 +587,18 @@ class NodeEffects:
         self._note_execution = transport.note_execution
         self.give_way = transport.give_way
         self._instruments = instruments
-        self._sent: dict[str, Tap] = {}
-        self._taps_to_itself: dict[Connection, Tap] = {}
+        self._sent: dict[str, Passage] = {}
+        self._passages_to_itself: dict[Connection, Passage] = {}
         self._contexts, self._context = contexts, context
         self.note_ready = on_ready
         self._on_initialised = on_initialised
 
-    def tap(self, way: Way, port: Port, connection: Connection | None = None) -> Tap:
-        """A place where packets pass, with the instruments that want to look at them."""
-        tap = Tap(way, port, connection)
+    def passage(self, way: Way, port: Port, connection: Connection | None = None) -> Passage:
+        """A place where packets pass, with the observers of all instruments."""
+        passage = Passage(way, port, connection)
         for instrument in self._instruments:
-            instrument.attach(tap)
-        return tap
+            instrument.attach(passage)
+        return passage
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         """Run a hook in the context of its node.
@@ -619,7 +619,7 @@ class NodeEffects:
         if spec.kind is HookKind.INITIALISE:
             self._on_initialised()
         if self._time.is_watched:
-            self._time.look()
+            self._time.update()
         return result
 
     def finalise(self, spec: HookSpec) -> None:
@@ -638,15 +638,15 @@ class NodeEffects:
     def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None] | None:
         """Return what sends packets of an output, and shows them to the instruments."""
         transmit: Callable[[Any], bytes | None]
-        tap = self._sent.get(port.name)
-        if tap is None:  # else the node was reset
-            tap = self._sent[port.name] = self.tap(Way.SENT, port)
-        observed = tap
+        passage = self._sent.get(port.name)
+        if passage is None:  # else the node was reset
+            passage = self._sent[port.name] = self.passage(Way.SENT, port)
+        observed = passage
         if port.external_topic is not None:
             transmit = partial(self._transport.send_external, port)
         elif connections:
             transmit = self._transport.sender(connections)
-        elif tap.observers:
+        elif passage.observers:
             transmit = lambda _: None  # noqa: E731 - of an output that nothing is connected to
         else:
             return None
@@ -666,10 +666,11 @@ class NodeEffects:
 
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
         port = self._handle.description.output(connection.source_output)
-        tap = self._taps_to_itself.get(connection)
-        if tap is None:
-            tap = self._taps_to_itself[connection] = self.tap(Way.TO_ITSELF, port, connection)
-        for observe in tap.observers:
+        passage = self._passages_to_itself.get(connection)
+        if passage is None:
+            passage = self.passage(Way.TO_ITSELF, port, connection)
+            self._passages_to_itself[connection] = passage
+        for observe in passage.observers:
             observe(packet, None)
         return self._copier(port.type)(packet)
 
