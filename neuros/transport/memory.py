@@ -263,11 +263,11 @@ class MemoryLink:
     """
 
     __slots__ = (
-        "_destination",
+        "_destination_end",
         "_loop",
         "_packets",
         "_positions",
-        "_source",
+        "_source_end",
         "_window",
         "connection",
         "received",
@@ -280,21 +280,21 @@ class MemoryLink:
         self._window = connection.window
         self._packets: deque[tuple[Any, int | None]] = deque(maxlen=self._window)
         self._positions: deque[int] = deque()
-        self._destination = hub.ends[connection.destination_node]
-        self._source = hub.ends[connection.source_node]
+        self._destination_end = hub.ends[connection.destination_node]
+        self._source_end = hub.ends[connection.source_node]
         self.sent, self.received = array("Q"), array("Q")
 
     def send(self, packet: Any, digest: int | None) -> None:
         """Put a packet on its way, with its digest if that is kept."""
         if len(self._packets) < self._window:  # else an event is on its way for one that is lost
-            self._destination.sent += 1
+            self._destination_end.sent += 1
             self._loop.post(self._receive)
         self._packets.append((packet, digest))
 
     def acknowledge(self, position: int) -> None:
         """Put the acknowledgement of a position on its way back."""
-        if self._destination.is_open:
-            self._source.sent += 1
+        if self._destination_end.is_open:
+            self._source_end.sent += 1
             self._positions.append(position)
             self._loop.post(self._receive_position)
 
@@ -309,11 +309,11 @@ class MemoryLink:
         packet, digest = self._packets.popleft()
         if digest is not None:
             self.received.append(digest)
-        end = self._destination
+        end = self._destination_end
         end.arrived += 1
         end.inbox.on_packet(self.connection, packet)
 
     def _receive_position(self) -> None:
-        end = self._source
+        end = self._source_end
         end.arrived += 1
         end.inbox.on_acknowledgement(self.connection, self._positions.popleft())
