@@ -311,12 +311,7 @@ class NodeRuntime:
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let the hooks that drive the project start so many times more."""
-        engine = self.engine
-        assert engine is not None
-        try:
-            engine.step(count, is_driven=is_driven)
-        except NeurosError as error:
-            self.failures.report(error)
+        self._guard(partial(self._loaded.step, count, is_driven=is_driven))
 
     def stop(self) -> None:
         """Start no further hook. Any thread."""
