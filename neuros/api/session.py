@@ -185,7 +185,7 @@ class Session:
                 return False
             is_counted = sim_s is None and until is None
             for _ in range(count) if is_counted else self._rounds(sim_s, until):
-                if not self._advance(1, end_s):
+                if not self._take(self._held.advance(1, self._known, end_s)):
                     return False
             return self.is_running  # `until` may have closed it
 

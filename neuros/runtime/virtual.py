@@ -470,16 +470,18 @@ class VirtualLink(MemoryLink):
             self._destination.arrive(way[0], self.connection.index, way[1], arrive)
 
     def acknowledge(self, position: int) -> None:
+        if not self._destination_end.is_open:
+            return
         way = self._back.send(self._destination.now_ns)
         assert way is not None  # no acknowledgement is lost
-        inbox = self._hub.inboxes[self.connection.source_node]
+        inbox = self._source_end.inbox
         arrive = partial(inbox.on_acknowledgement, self.connection, position)
         self._source.arrive(way[0], self.connection.index, way[1], arrive)
 
     def _arrive(self, packet: Any, digest: int | None) -> None:
         if digest is not None:
             self.received.append(digest)
-        self._hub.inboxes[self.connection.destination_node].on_packet(self.connection, packet)
+        self._destination_end.inbox.on_packet(self.connection, packet)
 
 
 class VirtualHub(MemoryHub):
@@ -498,7 +500,7 @@ class VirtualHub(MemoryHub):
 
     def _register(self, connection: Connection) -> None:
         source = connection.source_node
-        event = partial(self.inboxes[source].on_registered, connection)
+        event = partial(self.ends[source].inbox.on_registered, connection)
         self.virtual.of(source).post(event)
 
 

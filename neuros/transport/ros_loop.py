@@ -127,7 +127,8 @@ class RosLoop:
         if self._has_posted_turn:
             self._is_turn_stale = True
         else:
-            self._post_turn()
+            self._has_posted_turn = True
+            self._executor.create_task(self._turn)
 
     @property
     def has_waiting_events(self) -> bool:

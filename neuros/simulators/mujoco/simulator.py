@@ -9,7 +9,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, TimeoutError
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ _BOUT_STEPS = 20
 _IDLE_S = 0.1
 _REFRESH_S = 1 / 60
 _SPACE = 32
+_ALONE = nullcontext()
 _CLOSE_S = 4.0  # shorter than a node's time to end; software OpenGL is slow to close
 
 
@@ -279,11 +280,11 @@ class MuJoCo:
     # ---- inside -----------------------------------------------------------------------------
 
     def _set(self, controls: Callable[[], Controls]) -> None:
-        if self.is_running:
-            with self.paused():
-                self._world.control(controls())
-        else:  # no other thread uses the data
-            self._world.control(controls())
+        # Where the plugin steps, no other thread uses the data.
+        with self.paused() if self.is_running else _ALONE:
+            ctrl = self._world.data.ctrl
+            for actuator, value in controls():
+                ctrl[actuator] = value
 
     def _bout(self, steps: int) -> Mapping[str, Packet]:
         """Up to ``steps`` steps, ending at a firing; the packets that are due then."""

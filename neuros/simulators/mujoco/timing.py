@@ -168,11 +168,7 @@ class StepLock:
         self._one_visitor = threading.RLock()
         self._visitors = 0
         self._is_stepping = False
-        self._is_paused = False
-
-    @property
-    def is_paused(self) -> bool:
-        return self._is_paused
+        self.is_paused = False
 
     @contextmanager
     def visit(self) -> Iterator[None]:
@@ -190,11 +186,11 @@ class StepLock:
 
     def pause(self) -> None:
         """Keep further steps from beginning until :meth:`resume`; returns at once."""
-        self._is_paused = True
+        self.is_paused = True
 
     def resume(self) -> None:
         with self._changed:
-            self._is_paused = False
+            self.is_paused = False
             self._changed.notify_all()
 
     def wake(self) -> None:
@@ -205,7 +201,7 @@ class StepLock:
     def wait_resumed(self, seconds: float) -> None:
         """Wait until stepping is resumed, at most ``seconds``, or until :meth:`wake`."""
         with self._changed:
-            if self._is_paused:
+            if self.is_paused:
                 self._changed.wait(seconds)
 
     def enter(self, cancelled: Callable[[], bool], seconds: float | None = None) -> bool:
@@ -215,7 +211,7 @@ class StepLock:
         """
         with self._changed:
             may_try = self._changed.wait_for(
-                lambda: cancelled() or not (self._is_paused or self._visitors), seconds
+                lambda: cancelled() or not (self.is_paused or self._visitors), seconds
             )
             if cancelled() or not may_try:
                 return False

@@ -20,13 +20,7 @@ from neuros.project import suggest
 from neuros.project.model import MODEL_FIELDS, Node
 from neuros.registry import MODELS
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
-from neuros.simulators.mujoco.commands import (
-    Command,
-    Controls,
-    add_drives,
-    bind_commands,
-    read_commands,
-)
+from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
 from neuros.simulators.mujoco.lookup import Problems, did_you_mean, has_any, names_of
 from neuros.simulators.mujoco.sensor_base import Sensor
 from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
@@ -160,12 +154,6 @@ class World(Declared):
             )
             self._bind(self.model, problems, may_wait=False)
             problems.raise_any()
-
-    def control(self, controls: Controls) -> None:
-        """Set controls, from the next step on."""
-        ctrl = self.data.ctrl
-        for actuator, value in controls:
-            ctrl[actuator] = value
 
     def step(self, count: int) -> None:
         """Advance the physics; raises ``ModelError`` if it has become unstable."""
