@@ -58,6 +58,9 @@ class MessagePackages(Protocol):
     def messages(self, package: str) -> Collection[str] | None:
         """The names of a package's messages, ``None`` if there is no such package."""
 
+    def elsewhere(self, package: str, name: str) -> str:
+        """The wrong folder in which a package has a message, in a sentence; empty if in none."""
+
     def installed(self, package: str) -> Path | None:
         """The folder of the built package, ``None`` if there is no such package."""
 
@@ -70,6 +73,9 @@ class NoPackages:
 
     def messages(self, package: str) -> None:
         return None
+
+    def elsewhere(self, package: str, name: str) -> str:
+        return ""
 
     def installed(self, package: str) -> None:
         return None
@@ -221,7 +227,10 @@ def unknown_type(
     folder = message_folder(package)
     own = packages.messages(package) if folder is None else None
     if own is not None:
-        return None if name in own else _no_message(type_name, own)
+        if name in own:
+            return None
+        text, hint = _no_message(type_name, own)
+        return text, packages.elsewhere(package, name) or hint
     if folder is None:
         if not must_be_here:
             return None
