@@ -136,7 +136,6 @@ def _replay(options: argparse.Namespace) -> int:
     from neuros.backends.domain import given_domain
     from neuros.bag import open_bag
     from neuros.cli.environments import find_messages_of
-    from neuros.recording.recording_plan import is_named
     from neuros.transport.ros_topics import RosTopic, play
 
     domain_id = given_domain(options.domain_id, os.environ)
@@ -144,12 +143,7 @@ def _replay(options: argparse.Namespace) -> int:
     with open_bag(options.run) as bag:
         if bag.damage is not None:
             print(f"neuros: {bag.damage}", file=sys.stderr)
-        topics, patterns = [*bag.topics.values()], options.replay_topics
-        for pattern in patterns:
-            if not any(is_named(t.name, t.connection, [pattern]) for t in topics):
-                there = ", ".join(t.connection or t.name for t in topics)
-                raise UsageError(f"--topic {pattern}: the bag has no such topic; it has {there}")
-        chosen = [t for t in topics if is_named(t.name, t.connection, patterns)]
+        chosen = bag.chosen(options.replay_topics)
         packets = sorted(
             (packet.log_time_ns, topic.name, packet.data)
             for topic in chosen
