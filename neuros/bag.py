@@ -25,9 +25,10 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from rosbags.interfaces import Connection, QosDurability, QosReliability
+from rosbags.typesys import Stores, get_typestore
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.recording.bag_writer import BagWriter
+from neuros.recording.bag_writer import BagWriter, define
 from neuros.recording.columns import LOG_TIME, PUBLISH_TIME, Column, columns_of
 from neuros.recording.recorder import lost_of, named, needs_repair, recorded_counts, repair
 from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, Topic, is_named, load_plan
@@ -99,6 +100,21 @@ class RecordedTopic:
             except EnvironmentFault as fault:
                 place = f"{self._bag.folder}: {self.name}"
                 raise EnvironmentFault(f"{place} cannot be decoded: {fault}") from fault
+
+    @property
+    def misfit(self) -> str:
+        """Why programs of this machine cannot read its packets, in a sentence; empty if they can.
+
+        Raises:
+            EnvironmentFault: if its type is not known at all.
+        """
+        how, here = self.definition, get_typestore(Stores.EMPTY)
+        try:
+            define(how.name, here)
+        except EnvironmentFault as fault:
+            return str(fault)
+        is_same = here.hash_rihs01(how.name) == how.store.hash_rihs01(how.name)
+        return "" if is_same else f"{how.name} has other fields in the bag than it has here"
 
     def decode(self, data: bytes) -> Any:
         """A message from a packet. Raises ``EnvironmentFault`` for other bytes."""
