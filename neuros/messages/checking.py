@@ -29,6 +29,7 @@ from rosidl_adapter.parser import (
 from neuros.errors import Problem
 from neuros.messages.package import MANIFEST, Package, problem_at
 from neuros.messages.workspace import Workspaces
+from neuros.project.message_types import similar_package
 from neuros.project.suggest import did_you_mean
 
 _PARTS = {".msg": 1, ".srv": 2, ".action": 3}
@@ -98,7 +99,8 @@ def _unknown(package: Package, file: Path, use: Use, workspaces: Workspaces) -> 
     if messages is None:
         known = {*workspaces.packages, *workspaces.ros.message_packages()}
         text = f"found '{use.type}', expected a message of a package that is here"
-        hint = did_you_mean(of, known) or f"there is no package '{of}'"
+        similar = similar_package(of, known) or f"there is no package '{of}'."
+        hint = f"{similar} If '{of}' exists, put it into the workspace, too"
     elif name not in messages:
         text = f"found '{use.type}', expected a message of '{of}'"
         hint = workspaces.elsewhere(of, name) or did_you_mean(name, messages)

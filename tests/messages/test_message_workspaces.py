@@ -202,8 +202,14 @@ class TestMistakes:
         ("field", "said"),
         [
             ("sensor_msgs/Imuu i", "expected a message of 'sensor_msgs' (did you mean 'Imu'?)"),
-            ("sensr_msgs/Imu i", "is here (did you mean 'sensor_msgs'?)"),
-            ("nothing_like_it/X x", "is here (there is no package 'nothing_like_it')"),
+            (
+                "sensr_msgs/Imu i",
+                "is here (did you mean 'sensor_msgs'? If 'sensr_msgs' exists",
+            ),
+            (
+                "no_such/X x",
+                "is here (there is no package 'no_such'. If 'no_such' exists",
+            ),
             ("Pint p", "expected a message of 'a_msgs' (did you mean 'Point'?)"),
         ],
     )
