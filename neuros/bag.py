@@ -184,7 +184,9 @@ class RecordedTopic:
         Raises:
             UsageError: without the extension that makes datasets.
         """
-        return BAG_FORMATS.load("xarray")(self, self.definition.store.fielddefs, self._bag.start_ns)
+        known, name = self.definition.store.fielddefs, self.definition.name
+        types = {**known, self.type: known[name]}
+        return BAG_FORMATS.load("xarray")(self, types, self._bag.start_ns)
 
     def neo(self) -> Any:
         """A ``neo.Segment`` of recorded spikes (``neuros_msgs/msg/Spikes``).

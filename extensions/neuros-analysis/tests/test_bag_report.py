@@ -12,6 +12,7 @@ import pytest
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_typestore
 
+import neuros.bag
 from neuros.cli.main import main
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -79,3 +80,15 @@ def test_a_file_that_is_no_bag_is_refused(
     (tmp_path / "notes.txt").write_text("notes")
     assert main(["report", str(tmp_path / "notes.txt")]) == 2
     assert "notes.txt is no bag" in capsys.readouterr().err
+
+
+def test_a_type_by_its_short_name_has_arrays_frames_and_datasets(bag: Path) -> None:
+    """As some programs write it: ``std_msgs/Float64``."""
+    (file,) = bag.glob("*.db3")
+    with closing(sqlite3.connect(file)) as database, database:
+        database.execute("UPDATE topics SET type = 'std_msgs/Float64' WHERE name LIKE '%height'")
+    with neuros.bag.open(file) as opened:
+        topic = opened["/<b>height"]
+        assert topic.array()["data"].tolist() == [1.0] * 4
+        assert topic.frame()["data"].tolist() == [1.0] * 4
+        assert topic.xarray()["data"].values.tolist() == [1.0] * 4
