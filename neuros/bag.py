@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import cached_property
@@ -346,8 +347,10 @@ class Bag:
                 if topic in numbers:
                     writer.put(numbers[topic], log_ns, publish_ns, data)
             writer.close()
-        finally:
+        except BaseException:
             writer.shut()
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
         return sum(writer.counts.values())
 
     def packets_of(self, name: str) -> list[RawPacket]:

@@ -68,12 +68,16 @@ class FileContents(NamedTuple):
     """Topics of one file, its first and last time, and the ROS distribution, if it names one.
 
     Without messages, the first time comes after the last.
+
+    Attributes:
+        note: a sentence about what is odd, and no damage; empty if nothing is.
     """
 
     connections: list[Connection]
     start_ns: int
     end_ns: int
     distribution: str = ""
+    note: str = ""
 
 
 class Storage(Protocol):
@@ -204,12 +208,13 @@ class McapFile:
 
     def contents(self, *, is_complete: bool) -> FileContents:
         with open_ordinary(self._path) as file:
-            known = Summary()
+            known, note = Summary(), ""
             try:
                 known = _summary_of(file)
             except Exception:  # of a damaged file, mcap may raise anything
                 if is_complete:
                     raise
+                note = f"{self._path.name} has no end: what is there was recorded before"
             if (found := known.statistics) is not None and _is_full(known):
                 counts: Mapping[int, int] = found.channel_message_counts
                 first_ns, last_ns = found.message_start_time, found.message_end_time
@@ -234,7 +239,7 @@ class McapFile:
             before = connections.get(made.topic)
             count = made.msgcount + (before.msgcount if before else 0)
             connections[made.topic] = made._replace(msgcount=count)
-        return FileContents([*connections.values()], first_ns, last_ns)
+        return FileContents([*connections.values()], first_ns, last_ns, note=note)
 
     @staticmethod
     def _counted(file: BinaryIO, known: Summary) -> tuple[Counter[int], int, int]:

@@ -113,9 +113,10 @@ class StoredBag:
                         f"{each.topic} is of type {before.msgtype}, and {each.msgtype}"
                     )
                 found[each.topic] = before._replace(msgcount=before.msgcount + each.msgcount)
-            notes: list[str] = []
+            notes = [part.note for part in parts if part.note]
             if metadata is not None:
-                found, notes = _agreed(metadata, found)
+                found, differences = _agreed(metadata, found)
+                notes += differences
             start_ns = min((part.start_ns for part in parts), default=LAST_NS)
             end_ns = max((part.end_ns for part in parts), default=0)
             told = [each.distribution for each in parts if each.distribution]

@@ -391,6 +391,27 @@ class TestDamage:
         with neuros.bag.open(folder) as bag:
             assert bag["/height"].array()["data"].tolist() == VALUES
 
+    def test_a_file_that_was_cut_off_is_read_up_to_there_and_noted(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        file = mcap_file(tmp_path / "a.mcap", use_chunking=False)
+        data = file.read_bytes()
+        file.write_bytes(data[: data.index(PACKETS[2]) + 6])
+        with neuros.bag.open(file) as bag:
+            assert bag["/height"].array()["data"].tolist() == VALUES[:2]
+        assert main(["bag", "info", str(file)]) == 0
+        assert "note: a.mcap has no end: what is there was recorded" in capsys.readouterr().out
+
+    def test_nothing_is_left_of_a_conversion_that_fails(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        file = mcap_file(tmp_path / "a.mcap", compression=CompressionType.NONE)
+        data = file.read_bytes()
+        file.write_bytes(data.replace(PACKETS[1], PACKETS[2], 1))
+        assert main(["bag", "convert", str(file), "-o", str(tmp_path / "new")]) == 4
+        assert "is damaged between bytes" in capsys.readouterr().err
+        assert not (tmp_path / "new").exists()
+
     def test_a_file_that_is_missing_is_named(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
