@@ -126,6 +126,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "replay.replayed_node": {"debugpy"},
     "node.copies": {"numpy"},
     "recording": {"mcap", "rosbags", "psutil", "tabulate", "numpy", "xxhash"},
+    "recording.stored": {"mcap", "rosbags", "ruamel", "backports", "compression"},
     "visualise": {"numpy"},
     "visualise.program": {"matplotlib", "numpy"},
     "recording.columns": {"rosbags", "numpy"},

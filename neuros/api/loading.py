@@ -95,6 +95,7 @@ def load_with_messages(
         if problems:
             raise ProjectError(problems)
     doubts = (
+        *messages.doubts(),
         *_unknown_in_containers(loaded.project, workspaces),
         *(doubt for node, check in checks for doubt in check.doubts(node)),
         *(foreseen_failures(loaded.project, messages, looks_beside=False) if reads_plugins else ()),

@@ -37,9 +37,13 @@ def add_report(report: argparse.ArgumentParser) -> None:
         "Say what limited the speed of a run, and write a page (HTML, one file) with figures, and"
         " the figures themselves (PNG)."
     )
-    report.add_argument("run", metavar="RUN", type=Path, help="a run folder")
+    report.add_argument("run", metavar="RUN", type=Path, help="a run folder, or a bag")
     report.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="where to write (default: RUN/report)"
+        "-o",
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="where to write (default: RUN/report; of a bag, BAG_report in the current folder)",
     )
     report.set_defaults(command=_report)
 
@@ -59,10 +63,13 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
 
 
 def _report(options: argparse.Namespace) -> int:
+    from neuros_analysis.bag_pages import is_foreign_bag
     from neuros_analysis.findings import findings_of
     from neuros_analysis.review import open_for_review
     from neuros_analysis.run_pages import figures_of, panels_page, report_page, world_pages
 
+    if is_foreign_bag(options.run):
+        return _report_bag(options)
     run = open_for_review(options.run)
     folder = options.output or options.run / "report"
     if options.output is None and folder.is_symlink():
@@ -96,6 +103,33 @@ def _report(options: argparse.Namespace) -> int:
         print(f"{folder / name}: the world in 3-D")
     for name in pages:
         print(f"{folder / name}: spikes and activity")
+    return 0
+
+
+def _report_bag(options: argparse.Namespace) -> int:
+    """Write the page of a bag of another program."""
+    from tabulate import tabulate
+
+    from neuros.bag import open_bag
+    from neuros_analysis.bag_pages import HEADER, bag_page, times_of
+    from neuros_analysis.run_pages import panels_of
+
+    folder = options.output or Path(f"{options.run.resolve().name}_report")
+    with open_bag(options.run) as bag:
+        topics = times_of(bag)
+        pages = {_PAGE: bag_page(bag, topics)}
+        if panels := panels_of(bag, bag.folder.name):
+            pages["panels.html"] = panels
+        notes = [*bag.notes, *(topic.remark for topic in topics if topic.remark)]
+    print(tabulate([topic.row for topic in topics], HEADER, disable_numparse=True))
+    for note in notes:
+        print(f"note: {note}")
+    with _writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in pages.items():
+            write_whole(folder / name, text.encode())
+    for name in pages:
+        print(folder / name)
     return 0
 
 
