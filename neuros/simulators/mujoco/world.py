@@ -6,6 +6,7 @@ import contextlib
 import copy
 import json
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping, MutableSet, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from neuros.simulators.mujoco.sensor_base import Sensor
 from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
 from neuros.simulators.mujoco.timing import FiringSchedule, Timebase
 
+_PROLOGUE = re.compile(r"<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>]*>", re.DOTALL)
 _NUMBERS = (int, float, np.ndarray)  # types of fields of a model
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
@@ -463,11 +465,24 @@ def problems_of(description: Node, model: Path | str) -> list[tuple[str, str]]:
 
 def _from_text(description: Node, model: str) -> tuple[Any, str]:
     where = f"XML text in {description.plugin}"
+    if _is_urdf(model):
+        raise ModelError(f"{where}: this is URDF; write it to a file that ends in .urdf")
     return compiled(lambda: mujoco.MjSpec.from_string(model), where), where
+
+
+def _is_urdf(xml: str | Path) -> bool:
+    """Whether XML is URDF, which MuJoCo reads with defaults of its own in the place of URDF's."""
+    try:
+        text = xml if isinstance(xml, str) else xml.read_text("utf-8", "replace")
+    except OSError:
+        return False
+    return _PROLOGUE.sub("", text).lstrip("\ufeff \t\r\n").startswith("<robot")
 
 
 def _from_file(description: Node, path: Path, warn: Callable[[str], object]) -> Any:
     kind = path.suffix.lower()
+    if kind in (".xml", ".mjcf") and _is_urdf(path):
+        kind = ".urdf"
     if kind == ".xml":
         return compiled(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
     if kind == ".mjcf":  # MuJoCo's from_file knows .xml only
