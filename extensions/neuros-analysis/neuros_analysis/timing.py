@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -29,6 +28,7 @@ from neuros.api.run_record import PastRun, open_run, open_whole
 from neuros.distribution import __version__
 from neuros.errors import UsageError
 from neuros.project.model import Connection
+from neuros.project.timing import LEAST_DELAY_NS, Distribution
 from neuros.recording.run_file import RUN_FILE
 from neuros.registry import ran_in_one_process
 from neuros_analysis.options import FITS
@@ -38,7 +38,6 @@ MOST_SAMPLES = 1000
 """Of one hook or connection in a file; of more values, quantiles at equal steps."""
 ENOUGH = 30
 """Of fewer packets, acknowledgements show the delay, if there are more of them."""
-LEAST_S = 1e-9
 
 _MOST_WINDOWS, _OF_A_WINDOW = 16, 20
 
@@ -55,37 +54,24 @@ class Measured:
     values_s: Numbers
     of: str
 
-    def fit(self, name: str) -> Any:
-        """The distribution of one of :data:`FITS` as a file of timing has it.
+    def fit(self, kind: str) -> Distribution:
+        """The distribution of one of :data:`FITS`.
 
         ``samples``: the values themselves, or as many quantiles as a file holds; ``lognormal`` and
         ``normal``: the maximum-likelihood fit; ``constant``: the mean.
         """
-        if name == "constant":
-            return _rounded(self.values_s.mean())
-        if name == "normal":
-            return {name: [_rounded(self.values_s.mean()), _rounded(self.values_s.std())]}
-        if name == "lognormal":
-            logarithms = np.log(self.values_s)
-            return {name: [_rounded(np.exp(logarithms.mean())), float(f"{logarithms.std():.6g}")]}
         values_s = self.values_s
-        if len(values_s) > MOST_SAMPLES:
-            values_s = np.quantile(values_s, _shares(MOST_SAMPLES))
-        return {"samples": [_rounded(value) for value in values_s]}
-
-    def fitted_s(self, name: str) -> Numbers:
-        """Quantiles of the fit at equal steps, cut at 0, (samples,)."""
-        fit = self.fit(name)
-        if name == "samples":
-            return np.array(fit[name])
-        if name == "constant":
-            return np.full(MOST_SAMPLES, fit)
-        normal = NormalDist()
-        scores = np.array([normal.inv_cdf(share) for share in _shares(MOST_SAMPLES)])
-        first, second = fit[name]
-        found = first * np.exp(second * scores) if name == "lognormal" else first + second * scores
-        cut: Numbers = np.maximum(found, 0.0)
-        return cut
+        if kind == "constant":
+            found: Any = [values_s.mean()]
+        elif kind == "normal":
+            found = [values_s.mean(), values_s.std()]
+        elif kind == "lognormal":
+            found = [np.exp(np.log(values_s).mean()), np.log(values_s).std()]
+        elif len(values_s) > MOST_SAMPLES:
+            found = np.quantile(values_s, _shares(MOST_SAMPLES))
+        else:
+            found = values_s
+        return Distribution(kind, tuple(round(float(value), 9) for value in found))
 
 
 @dataclass(frozen=True)
@@ -112,13 +98,13 @@ class Timing:
         """Hooks and connections together."""
         return {**self.hooks, **self.connections}
 
-    def file(self, fit: str = FITS[0]) -> str:
+    def file(self, kind: str = FITS[0]) -> str:
         """The content of a file for ``neuros launch --timing``: JSON, a line per distribution."""
         counts = {
             name: {"count": len(each.values_s), "of": each.of} for name, each in self.all.items()
         }
         provenance = {
-            "as": fit,
+            "as": kind,
             "written": datetime.now(timezone.utc).isoformat("T", "seconds"),
             "neuros": __version__,
             **self.provenance,
@@ -127,7 +113,9 @@ class Timing:
         }
         parts = [f'"provenance": {json.dumps(provenance, indent=2)}']
         for key, group in (("hooks", self.hooks), ("connections", self.connections)):
-            lines = (f"{json.dumps(n)}: {json.dumps(each.fit(fit))}" for n, each in group.items())
+            lines = (
+                f"{json.dumps(n)}: {json.dumps(each.fit(kind).keys)}" for n, each in group.items()
+            )
             parts.append(f'"{key}": {{\n' + ",\n".join(lines) + "\n}")
         return "{\n" + ",\n".join(parts) + "\n}\n"
 
@@ -153,7 +141,7 @@ def measure(folder: Path) -> Timing:
             why = "no hook has run, or the folder packets of each node is missing"
         raise UsageError(f"{folder} has no times of hooks: {why}")
     hooks = {
-        f"{node}.{hook}": Measured(np.maximum(durations_ns * 1e-9, LEAST_S), "executions")
+        f"{node}.{hook}": Measured(np.maximum(durations_ns, 1) * 1e-9, "executions")
         for node, trace in lists.traces.items()
         for hook, durations_ns in _durations_ns(trace).items()
     }
@@ -169,15 +157,16 @@ def measure(folder: Path) -> Timing:
             missing[name] = lists.why_unknown(end)
             continue
         latencies_s[name] = np.diff(flights_ns).ravel() * 1e-9
-        found = Measured(latencies_s[name][lists.found_free(end)], "packets")
-        if len(found.values_s) < ENOUGH:
-            answers = Measured(lists.answers_ns(end) * 1e-9, "acknowledgements")
-            found = max(found, answers, key=lambda each: len(each.values_s))
-        if len(found.values_s):
-            connections[name] = replace(found, values_s=np.maximum(found.values_s, LEAST_S))
+        if end.source_node == end.destination_node:
+            continue  # its packets are not sent, so they have no delay
+        delays_ns, of = np.diff(flights_ns[lists.found_free(end)]).ravel(), "packets"
+        if len(delays_ns) < ENOUGH and len(answers_ns := lists.answers_ns(end)) > len(delays_ns):
+            delays_ns, of = answers_ns, "acknowledgements"
+        if len(delays_ns):
+            connections[name] = Measured(np.maximum(delays_ns, LEAST_DELAY_NS) * 1e-9, of)
         else:
             missing[name] = (
-                f"no packet found '{end.destination_node}' free"
+                f"no packet found '{end.destination_node}' free, or its hooks do not wait for packets"
                 if len(flights_ns)
                 else "no hook has started on a packet"
             )
@@ -254,8 +243,9 @@ def _shares(count: int) -> Numbers:
     return found
 
 
-def _rounded(seconds: Any) -> float:
-    return round(float(seconds), 9)
+def drawn_s(distribution: Distribution) -> Numbers:
+    """Quantiles at equal steps of what is drawn from a distribution, (samples,)."""
+    return np.array([distribution.at_ns(share) for share in _shares(MOST_SAMPLES)]) * 1e-9
 
 
 # ---------------------------------------------------------------------- lists

@@ -95,21 +95,16 @@ def _timing(options: argparse.Namespace) -> int:
 
 def _fitted(timing: Timing, fit: str) -> tuple[_Rows, _Panels]:
     """A row and a panel for each hook and connection: what was measured, and the fit."""
-    from neuros_analysis.timing import distance
+    from neuros_analysis.timing import distance, drawn_s
 
     rows: _Rows = []
     panels = {}
     for name, each in timing.all.items():
-        fitted_s = each.fitted_s(fit)
-        rows.append(
-            {
-                "name": name,
-                "of": each.of,
-                "count": len(each.values_s),
-                **_figures(each.values_s),
-                f"distance of {fit}": distance(each.values_s, fitted_s),
-            }
-        )
+        row = {"name": name, "of": each.of, "count": len(each.values_s), **_figures(each.values_s)}
+        fitted_s = drawn_s(each.fit(fit))
+        if fit != FITS[0]:
+            row |= {fit: str(each.fit(fit).keys), "distance": distance(each.values_s, fitted_s)}
+        rows.append(row)
         panels[name] = {"measured": each.values_s, fit: fitted_s}
     return rows, panels
 
