@@ -165,8 +165,9 @@ def measure(folder: Path) -> Timing:
         if len(delays_ns):
             connections[name] = Measured(np.maximum(delays_ns, LEAST_DELAY_NS) * 1e-9, of)
         else:
+            free = f"no packet found '{end.destination_node}' free"
             missing[name] = (
-                f"no packet found '{end.destination_node}' free, or its hooks do not wait for packets"
+                f"{free}, or its hooks do not wait for packets"
                 if len(flights_ns)
                 else "no hook has started on a packet"
             )
