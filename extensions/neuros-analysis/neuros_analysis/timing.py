@@ -28,7 +28,7 @@ from neuros.api.run_record import PastRun, open_run, open_whole
 from neuros.distribution import __version__
 from neuros.errors import UsageError
 from neuros.project.model import Connection
-from neuros.project.timing import LEAST_DELAY_NS, Distribution
+from neuros.project.timing import LEAST_DELAY_NS, MOST_NS, Distribution
 from neuros.recording.run_file import RUN_FILE
 from neuros.registry import ran_in_one_process
 from neuros_analysis.options import FITS
@@ -68,7 +68,7 @@ class Measured:
         elif kind == "lognormal":
             found = [np.exp(np.log(values_s).mean()), np.log(values_s).std()]
         elif len(values_s) > MOST_SAMPLES:
-            found = np.quantile(values_s, _shares(MOST_SAMPLES))
+            found = np.quantile(values_s, _shares(MOST_SAMPLES), method="inverted_cdf")
         else:
             found = values_s
         return Distribution(kind, tuple(round(float(value), 9) for value in found))
@@ -141,7 +141,7 @@ def measure(folder: Path) -> Timing:
             why = "no hook has run, or the folder packets of each node is missing"
         raise UsageError(f"{folder} has no times of hooks: {why}")
     hooks = {
-        f"{node}.{hook}": Measured(np.maximum(durations_ns, 1) * 1e-9, "executions")
+        f"{node}.{hook}": Measured(np.clip(durations_ns, 1, MOST_NS) * 1e-9, "executions")
         for node, trace in lists.traces.items()
         for hook, durations_ns in _durations_ns(trace).items()
     }
@@ -163,7 +163,7 @@ def measure(folder: Path) -> Timing:
         if len(delays_ns) < ENOUGH and len(answers_ns := lists.answers_ns(end)) > len(delays_ns):
             delays_ns, of = answers_ns, "acknowledgements"
         if len(delays_ns):
-            connections[name] = Measured(np.maximum(delays_ns, LEAST_DELAY_NS) * 1e-9, of)
+            connections[name] = Measured(np.clip(delays_ns, LEAST_DELAY_NS, MOST_NS) * 1e-9, of)
         else:
             free = f"no packet found '{end.destination_node}' free"
             missing[name] = (
@@ -171,6 +171,7 @@ def measure(folder: Path) -> Timing:
                 if len(flights_ns)
                 else "no hook has started on a packet"
             )
+    missing |= {str(file): "the rest is left out: the file is damaged" for file in lists.damaged}
     provenance = {"runs": [_provenance(part) for part in parts], "clocks": lists.clocks.described}
     return Timing(hooks, connections, latencies_s, missing, provenance)
 
@@ -261,6 +262,7 @@ class _Lists:
         flights_ns: by connection, sending of a packet and start of a hook on it, for each start,
             (starts, 2); ``None`` if unknown.
         clocks: of the machines.
+        damaged: files that are read only up to an entry that no node writes.
     """
 
     def __init__(self, folder: Path, parts: Sequence[PastRun]) -> None:
@@ -275,6 +277,8 @@ class _Lists:
             for name in part.nodes
         }
         self.flights_ns = {name: self._flights_ns(name) for name in self.ends}
+        self.damaged = [file for each in self.traces.values() for file in each.damaged]
+        self.damaged += [file for each in self._packets.values() for file in each.damaged]
         self.clocks = _Clocks(parts, self)
         self._shift()
         self._processes: dict[str, tuple[Numbers, Numbers]] = {}

@@ -258,6 +258,22 @@ def test_times_of_a_deployment_are_on_one_clock_already(tmp_path: Path) -> None:
     assert timing.provenance["runs"][0]["machines"] == {"pi": ["b"]}
 
 
+LISTS = ("a/packets/executions", "a/packets/credits", "b/packets/executions", "b/packets/pauses")
+LISTS += ("a/packets/0.sent_ns", "b/packets/0.taken", "b/packets/0.taken_ns")
+numbers = st.lists(st.integers(0, 1) | st.integers(-(2**63), 2**63 - 1), max_size=40)
+
+
+@given(st.sampled_from(LISTS), numbers)
+def test_damaged_lists_give_what_a_file_can_have(
+    tmp_path_factory: pytest.TempPathFactory, file: str, numbers: list[int]
+) -> None:
+    folder = free().write(tmp_path_factory.mktemp("run"), {WIRE: 0})
+    np.array(numbers, np.int64).tofile(folder / file)
+    timing = measure(folder)
+    for kind in ("samples", "lognormal", "normal", "constant"):
+        assert mistake(json.loads(timing.file(kind)), "project", "#/$defs/timing") == ""
+
+
 # ---------------------------------------------------------------------- files
 
 
@@ -292,7 +308,7 @@ def test_samples_are_bounded_and_keep_the_distribution(seed: int, count: int) ->
     values_s = np.random.default_rng(seed).lognormal(-5, 1, count)
     samples = Measured(values_s, "executions").fit("samples").values
     assert len(samples) == MOST_SAMPLES
-    assert distance(values_s, np.array(samples)) <= 1.5 / MOST_SAMPLES
+    assert distance(values_s, np.array(samples)) < 2 / MOST_SAMPLES
 
 
 samples = st.lists(st.integers(0, 20), min_size=1, max_size=50)
