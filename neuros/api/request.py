@@ -159,6 +159,14 @@ class Request(ProjectOptions):
         help="end the run this long after its first hook started, and let packets under way"
         " arrive: 30 means seconds, 30sim simulated seconds",
     )
+    real_time_factor: float | None = option(
+        "--real-time-factor",
+        parse=positive_seconds,
+        metavar="FACTOR",
+        default_help="as fast as the machine allows",
+        page="time.md#virtual-time",
+        help="let at most this many seconds of virtual time pass per second of the machine",
+    )
     output: str | os.PathLike[str] | None = option(
         "-o",
         "--output",
