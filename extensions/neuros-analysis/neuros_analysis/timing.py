@@ -28,7 +28,7 @@ from neuros.api.run_record import PastRun, open_run, open_whole
 from neuros.distribution import __version__
 from neuros.errors import UsageError
 from neuros.project.model import Connection
-from neuros.project.timing import LEAST_DELAY_NS, MOST_NS, Distribution
+from neuros.project.timing import LEAST_DELAY_NS, MOST_NS, VIRTUAL, Distribution
 from neuros.recording.run_file import RUN_FILE
 from neuros.registry import ran_in_one_process
 from neuros_analysis.options import FITS
@@ -84,6 +84,7 @@ class Timing:
         latencies_s: by connection, from the sending of a packet to the start of a hook on it, with
             the time in which the receiver was busy, (starts,).
         missing: by hook, node or connection, why there is no measurement.
+        is_virtual: whether the run was in virtual time.
         provenance: where the run comes from, ready for JSON.
     """
 
@@ -91,6 +92,7 @@ class Timing:
     connections: Mapping[str, Measured]
     latencies_s: Mapping[str, Numbers]
     missing: Mapping[str, str]
+    is_virtual: bool
     provenance: Mapping[str, Any]
 
     @property
@@ -99,7 +101,16 @@ class Timing:
         return {**self.hooks, **self.connections}
 
     def file(self, kind: str = FITS[0]) -> str:
-        """The content of a file for ``neuros launch --timing``: JSON, a line per distribution."""
+        """The content of a file for ``neuros launch --timing``: JSON, a line per distribution.
+
+        Raises:
+            UsageError: if the run was in virtual time.
+        """
+        if self.is_virtual:
+            raise UsageError(
+                "the run was in virtual time, so its times were declared and not measured: name a"
+                " run in real time"
+            )
         counts = {
             name: {"count": len(each.values_s), "of": each.of} for name, each in self.all.items()
         }
@@ -173,7 +184,8 @@ def measure(folder: Path) -> Timing:
             )
     missing |= {str(file): "the rest is left out: the file is damaged" for file in lists.damaged}
     provenance = {"runs": [_provenance(part) for part in parts], "clocks": lists.clocks.described}
-    return Timing(hooks, connections, latencies_s, missing, provenance)
+    is_virtual = any(map(_is_virtual, parts))
+    return Timing(hooks, connections, latencies_s, missing, is_virtual, provenance)
 
 
 def _parts(folder: Path) -> list[PastRun]:
@@ -182,6 +194,11 @@ def _parts(folder: Path) -> list[PastRun]:
     if (folder / RUN_FILE).exists() or not files:
         return [open_for_review(folder)]
     return [open_run(file.parent) for file in files]
+
+
+def _is_virtual(part: PastRun) -> bool:
+    """Whether a run was in virtual time, where nodes of one process do not share their time."""
+    return (part.record.get("expanded_project") or {}).get("time") == VIRTUAL
 
 
 def _durations_ns(trace: Trace) -> dict[str, Numbers]:
@@ -272,7 +289,9 @@ class _Lists:
         self._packets = {name: read_packets(folder, end) for name, end in whole.ends.items()}
         self._may_lose = {name: may_have_lost(each) for name, each in whole.connections.items()}
         self._process_of = {
-            name: str(part.folder) if ran_in_one_process(part.record) else name
+            name: str(part.folder)
+            if ran_in_one_process(part.record) and not _is_virtual(part)
+            else name
             for part in parts
             for name in part.nodes
         }
