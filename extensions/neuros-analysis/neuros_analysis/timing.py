@@ -253,7 +253,7 @@ def by_chance(count: int, other: int) -> float:
 
     Smirnov 1948, doi:10.1214/aoms/1177730256: the limit for large samples.
     """
-    return 1.358 * float(np.sqrt((count + other) / (count * other)))
+    return min(1.0, 1.358 * float(np.sqrt((count + other) / (count * other))))
 
 
 def _shares(count: int) -> Numbers:
