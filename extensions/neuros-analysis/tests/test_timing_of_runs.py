@@ -39,6 +39,7 @@ def move(node, number, count=[0]):
         node.shutdown("forty")
 """
 TO_BRAIN, TO_MOTOR = "sensor.number -> brain.number", "brain.number -> motor.number"
+VIRTUAL = ("--backend", "in-process", "--time", "virtual")
 PORT = [{"name": "number", "type": "std_msgs/msg/Int32"}]
 
 
@@ -97,6 +98,49 @@ def test_of_a_run_in_real_time_all_hooks_and_connections_are_measured(
     loaded = load_project(project, workspace=WORKSPACE, time="virtual", timing=file).project
     assert {*loaded.node("brain").durations} == {"estimate"}
     assert all(each.delay.kind == "samples" for each in loaded.connections)
+
+
+def test_a_run_in_virtual_time_shows_what_was_declared(
+    tmp_path: Path, project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All nodes share a process, and still none keeps another one busy."""
+    content = json.loads((project / "project.json").read_text())
+    content["nodes"][1]["durations"] = {"estimate": 0.007}
+    for connection, delay in zip(content["connections"], (0.003, 0.0015), strict=True):
+        connection["delay"] = delay
+    (project / "project.json").write_text(json.dumps(content))
+    run = tmp_path / "run"
+    finished = launch(project, *VIRTUAL, "-o", str(run), cwd=tmp_path)
+    assert finished.exit_code == 0, finished.output
+    timing = measure(run)
+    assert {*timing.hooks["brain.estimate"].values_s} == {0.007}
+    for name, delay_s in ((TO_BRAIN, 0.003), (TO_MOTOR, 0.0015)):
+        assert timing.connections[name].values_s == pytest.approx(
+            [delay_s] * finished.connection(name)["consumed"]
+        )
+    assert main(["timing", str(run), "-o", str(tmp_path / "timing.json")]) == 2
+    assert "declared and not measured: name a run in real time" in capsys.readouterr().err
+
+
+def test_what_was_measured_is_repeated_in_virtual_time(
+    tmp_path: Path, project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two repetitions are equal, and their times are drawn from the measured ones."""
+    measured, file = tmp_path / "measured", tmp_path / "timing.json"
+    assert launch(project, "-o", str(measured), cwd=tmp_path).exit_code == 0
+    assert main(["timing", str(measured), "-o", str(file)]) == 0
+    repeated = [tmp_path / "repeated", tmp_path / "again"]
+    for run in repeated:
+        finished = launch(project, *VIRTUAL, "--timing", str(file), "-o", str(run), cwd=tmp_path)
+        assert finished.exit_code == 0, finished.output
+    assert main(["verify", *map(str, repeated)]) == 0
+    samples = json.loads(file.read_text())["hooks"]["brain.estimate"]["samples"]
+    drawn = measure(repeated[0]).hooks["brain.estimate"].values_s
+    assert {round(each, 9) for each in drawn} <= {*samples}
+    assert main(["timing", str(measured), str(repeated[0])]) == 0
+    out = capsys.readouterr().out
+    for name in ("brain.estimate", TO_BRAIN, f"{TO_BRAIN}: latency"):
+        assert any(line.startswith(f"{name} ") for line in out.splitlines())
 
 
 def test_parts_of_a_run_are_measured_together(tmp_path: Path, project: Path) -> None:
