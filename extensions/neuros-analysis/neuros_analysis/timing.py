@@ -37,7 +37,7 @@ from neuros_analysis.review import Trace, open_for_review, read_trace
 MOST_SAMPLES = 1000
 """Of one hook or connection in a file; of more values, quantiles at equal steps."""
 ENOUGH = 30
-"""Of fewer packets, acknowledgements show the delay, if there are more of them."""
+"""Where fewer packets show the delay, so many acknowledgements do."""
 
 _MOST_WINDOWS, _OF_A_WINDOW = 16, 20
 
@@ -136,8 +136,8 @@ def measure(folder: Path) -> Timing:
 
     A packet found its receiver free if no hook ran there between the sending of the packet and the
     start on it, if the hook starts on packets only, and if no later packet, acknowledgement or
-    pause can have held up the start. With fewer than :data:`ENOUGH` such packets, the delay is that
-    of the acknowledgements that found the sender free, if there are more of them.
+    pause can have held up the start. If fewer than :data:`ENOUGH` packets did so, and as many
+    acknowledgements found the sender free, these show the delay; without any packet, fewer will do.
 
     Raises:
         UsageError: if the folder is of no run, the run goes on, or has no times.
@@ -171,8 +171,10 @@ def measure(folder: Path) -> Timing:
         if end.source_node == end.destination_node:
             continue  # its packets are not sent, so they have no delay
         delays_ns, of = np.diff(flights_ns[lists.found_free(end)]).ravel(), "packets"
-        if len(delays_ns) < ENOUGH and len(answers_ns := lists.answers_ns(end)) > len(delays_ns):
-            delays_ns, of = answers_ns, "acknowledgements"
+        if len(delays_ns) < ENOUGH:
+            answers_ns = lists.answers_ns(end)
+            if len(answers_ns) >= (ENOUGH if len(delays_ns) else 1):
+                delays_ns, of = answers_ns, "acknowledgements"
         if len(delays_ns):
             connections[name] = Measured(np.clip(delays_ns, LEAST_DELAY_NS, MOST_NS) * 1e-9, of)
         else:

@@ -132,6 +132,14 @@ def test_of_a_receiver_that_is_always_busy_acknowledgements_show_the_delay(tmp_p
     assert delay.values_s == pytest.approx([3e-4] * 60)
 
 
+def test_a_few_packets_tell_more_than_a_few_acknowledgements(tmp_path: Path) -> None:
+    lists = busy(ENOUGH - 1)
+    lists.executions["a"] = lists.executions["a"][:1]
+    delay = measure(lists.write(tmp_path, {WIRE: 0})).connections[WIRE]
+    assert delay.of == "packets"
+    assert delay.values_s == pytest.approx([5e-3])
+
+
 def test_an_acknowledgement_that_found_its_sender_busy_does_not_count(tmp_path: Path) -> None:
     """The first 60 hooks of a sender end one after the other, and so do the waits for them."""
     lists = busy()
