@@ -9,6 +9,7 @@ that found their receiver free show the delay (see :func:`measure`).
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -140,7 +141,7 @@ def measure(folder: Path) -> Timing:
     acknowledgements found the sender free, these show the delay; without any packet, fewer will do.
 
     Raises:
-        UsageError: if the folder is of no run, the run goes on, or has no times.
+        UsageError: if the folder is of no run, or the run has no times of hooks.
         EnvironmentFault: if a file is damaged.
     """
     parts = _parts(folder)
@@ -164,6 +165,13 @@ def measure(folder: Path) -> Timing:
     connections, latencies_s = {}, {}
     for name, end in lists.ends.items():
         flights_ns = lists.flights_ns[name]
+        elsewhere = {end.source_node, end.destination_node} - {*lists.traces}
+        if elsewhere:
+            missing[name] = (
+                f"{' and '.join(elsewhere)} ran in another part: name a folder that holds the run"
+                " folders of all parts"
+            )
+            continue
         if flights_ns is None:
             missing[name] = lists.why_unknown(end)
             continue
@@ -195,7 +203,16 @@ def _parts(folder: Path) -> list[PastRun]:
     files = sorted(folder.glob(f"*/{RUN_FILE}"))
     if (folder / RUN_FILE).exists() or not files:
         return [open_for_review(folder)]
-    return [open_run(file.parent) for file in files]
+    parts = [open_run(file.parent) for file in files]
+    nodes = Counter(name for part in parts for name in part.nodes)
+    twice = [name for name, count in nodes.items() if count > 1]
+    if twice:
+        found = ", ".join(part.folder.name for part in parts if twice[0] in part.nodes)
+        raise UsageError(
+            f"{folder} holds several runs, and not the parts of one: node '{twice[0]}' ran in"
+            f" {found}: name one of them"
+        )
+    return parts
 
 
 def _is_virtual(part: PastRun) -> bool:

@@ -257,6 +257,22 @@ def test_without_acknowledgements_two_clocks_cannot_be_compared(tmp_path: Path) 
     assert [*timing.hooks] == ["a.send", "b.use"]
 
 
+def test_one_part_alone_does_not_know_the_way_to_the_others(tmp_path: Path) -> None:
+    part = in_parts(tmp_path, free(), drifting, 0) / "on_a"
+    timing = measure(part)
+    assert [*timing.hooks] == ["a.send"]
+    assert timing.missing == {
+        WIRE: "b ran in another part: name a folder that holds the run folders of all parts"
+    }
+
+
+def test_a_folder_of_several_runs_is_not_one_run(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        free().write(tmp_path / name, {WIRE: 0})
+    with pytest.raises(UsageError, match="node 'a' ran in first, second: name one of them"):
+        measure(tmp_path)
+
+
 def test_times_of_a_deployment_are_on_one_clock_already(tmp_path: Path) -> None:
     machines = {"pi": {"nodes": ["b"], "clock_ahead_s": 0.5}}
     lists = free()
