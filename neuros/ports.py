@@ -97,8 +97,8 @@ class Packets(Protocol):
     def packet_class(self, type_name: str) -> type:
         """The message class of a type, or NumPy's array. Raises ``EnvironmentFault``."""
 
-    def make(self, type_name: str) -> Packet:
-        """A new message with default values, or an array of zeros."""
+    def maker(self, type_name: str) -> Callable[[], Packet]:
+        """A function that makes a new message with default values, or an array of zeros."""
 
     def checker(self, type_name: str, *, for_jpeg: bool = False) -> Callable[[Packet], Packet]:
         """A check of packets of a type, also for JPEG.

@@ -28,15 +28,15 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 51_100)
+    hold("lines of neuros/", lines(NEUROS), 51_840)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 65_740)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 66_460)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 85_240)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 85_590)
 
 
 def test_private_functions_that_are_used_once() -> None:
@@ -44,7 +44,7 @@ def test_private_functions_that_are_used_once() -> None:
 
 
 def test_public_classes_of_one_name() -> None:
-    hold("names in several modules", classes_in_several_modules(NEUROS), 9)
+    hold("names in several modules", classes_in_several_modules(NEUROS), 6)
 
 
 @pytest.fixture(scope="module")

@@ -112,7 +112,9 @@ class ControlLink:
             BlockingIOError: if the stream does not block, and there is nothing to read.
             ControlError: if what arrives is no control channel at all.
         """
-        size = max(_READ_BYTES, min(_missing_bytes(self._received), _MOST_READ_BYTES))
+        length = int.from_bytes(self._received[:_LENGTH_BYTES], "little")
+        missing = length + _LENGTH_BYTES - len(self._received)  # of the first message
+        size = max(_READ_BYTES, min(missing, _MOST_READ_BYTES))
         try:
             data = self.stream.recv(size)
         except BlockingIOError:
@@ -246,11 +248,6 @@ def read_as(declared: type[_Declared], content: Any) -> _Declared:
         return msgspec.convert(content, declared)
     except msgspec.ValidationError as error:
         raise ControlError(str(error)) from None
-
-
-def _missing_bytes(received: bytearray) -> int:
-    """How much has to come for the first message to be whole."""
-    return int.from_bytes(received[:_LENGTH_BYTES], "little") + _LENGTH_BYTES - len(received)
 
 
 def _shown(data: bytes) -> str:

@@ -23,11 +23,13 @@ import neuros.control as control
 from neuros.control import Message
 from neuros.control.link import ControlLink, encode
 from neuros.errors import ControlError
-from neuros.launcher.outcome import Outcome, Phase, SupervisorOutput
+from neuros.launcher.outcome import Outcome, Phase
 from neuros.ports import ControlListener
 
 STRANGER = "an unknown program"
 _MOST_UNSENT_BYTES = 1 << 20
+_LEFT_OUT = control.GetStatus, control.NodeStatus, control.LogRecord
+"""Messages that are left out while so much waits to be sent."""
 _READS_AT_A_TIME = 64
 _WAKING_BYTES = 1024
 
@@ -120,7 +122,7 @@ class Channels:
         if link not in self._links:
             return
         is_full = len(link.unsent) >= _MOST_UNSENT_BYTES
-        if is_full and isinstance(message, control.Look | control.NodeStatus | control.LogRecord):
+        if is_full and isinstance(message, _LEFT_OUT):
             return
         link.unsent += encode(message)
         link.flush()
@@ -260,8 +262,8 @@ class Observers:
     _told: control.PhaseChanged | None = None
     _asked: dict[int, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
-    def take(self, link: ControlLink, message: Message) -> None:
-        """Take a message from or for an observer.
+    def receive(self, link: ControlLink, message: Message) -> None:
+        """Handle a message from or for an observer.
 
         Raises:
             ControlError: if it is a packet for what is no session's input; nothing has changed.
@@ -271,7 +273,7 @@ class Observers:
                 self._count += 1
                 self._links[self._count] = link
                 self._told = None
-            case control.LookAll(wanted):
+            case control.GetStatus(wanted):
                 for number, each in self._links.items():
                     if each is link:
                         self._asked[number] = wanted
@@ -296,7 +298,7 @@ class Observers:
                     whither = f"'{node}.{input_name}'"
                     raise ControlError(f"a packet came for {whither}, no session's input")
                 self._channels.send_to_node(node, message)
-            case control.StepAll(count):
+            case control.Step(count):
                 self._pause.step(count, is_driven=self._is_driven())
             case control.End(reason):
                 self._end(reason)
@@ -312,7 +314,7 @@ class Observers:
         One that has asked several times since is answered once.
         """
         for number, wanted in self._asked.items():
-            self._channels.send(control.Look(wanted, number))
+            self._channels.send(control.GetStatus(wanted, number))
         self._asked.clear()
         if phase is not Phase.RUNNING and self._pause.is_on:
             self._pause.forget()
@@ -338,21 +340,6 @@ class Observers:
                 outcome.has_drained,
             )
         )
-
-
-@dataclass
-class Overheard:
-    """An output for people whose records observers get, too."""
-
-    _output: SupervisorOutput
-    _tell: Callable[[Message], object]
-
-    def log(self, severity: str, text: str) -> None:
-        self._output.log(severity, text)
-        self._tell(control.LogRecord(severity, text))
-
-    def poll(self) -> object:
-        return self._output.poll()
 
 
 Counts: TypeAlias = Mapping[str, tuple[int, int]]
@@ -407,8 +394,8 @@ class Settling:
         if asker is self._asker:
             self._asker = self._due_s = None
 
-    def take(self, answer: control.AtRest) -> None:
-        """Take an answer of a process, perhaps to the last round."""
+    def add(self, answer: control.AtRest) -> None:
+        """An answer of a process has arrived, perhaps to the last round."""
         if answer.number != self._round or self._asker is None:
             return
         self._answers[answer.nodes] = answer

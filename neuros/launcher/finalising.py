@@ -15,7 +15,7 @@ LEAVE_S = 5.0
 _LOOK_S = 1.0
 
 
-class Finalising:
+class FinaliseTimes:
     """How long the nodes of each process have made no progress since the end began.
 
     A hook that ends, ``node.progress`` and a file that grows in the folder of a node are progress.
@@ -50,17 +50,17 @@ class Finalising:
         """The run stood still for so long."""
         self._moved_s = {name: moved_s + still_s for name, moved_s in self._moved_s.items()}
 
-    def note_progress(self, node: str, now_s: float) -> None:
+    def advance(self, node: str, now_s: float) -> None:
         """A node has made progress."""
         self._moved_s[node] = now_s
 
-    def note_hook(self, node: str, hook: str | None, now_s: float) -> None:
+    def enter(self, node: str, hook: str | None, now_s: float) -> None:
         """A node starts a finalise hook; ``""``: it closes what it holds; ``None``: it is done."""
         self._hooks[node] = hook
         if hook and hook in self._left.get(node, ()):
             self._left[node].remove(hook)
         self._since_s[node] = now_s
-        self.note_progress(node, now_s)
+        self.advance(node, now_s)
 
     def has_begun(self, names: Sequence[str]) -> bool:
         """Whether a process with these nodes runs no hook any more but finalise hooks."""
@@ -107,12 +107,8 @@ class Finalising:
         self._looked_s[node] = now_s
         before, now = self._sizes.get(node), _sizes(self._run_folder / node)
         self._sizes[node] = now
-        if before is not None and _has_grown(before, now):
-            self.note_progress(node, now_s)
-
-
-def _has_grown(before: Mapping[str, int], now: Mapping[str, int]) -> bool:
-    return any(size > before.get(path, -1) for path, size in now.items())
+        if before is not None and any(now[path] > before.get(path, -1) for path in now):
+            self.advance(node, now_s)
 
 
 def _sizes(folder: Path) -> dict[str, int]:

@@ -34,8 +34,9 @@ class SupervisorOutput(Protocol):
 
 
 class Phase(Enum):
-    """The phases of a run."""
+    """The phases of a run; it runs once every node has initialised."""
 
+    STARTING = "starting"
     RUNNING = "running"
     DRAINING = "draining"
     STOPPING = "stopping"
@@ -140,7 +141,7 @@ class Outcome:
         start_s, end = ending_s - running_s - paused_s, (times[owner], ending_s)
         return _advance(self.timelines.get(owner, ()), start_s, end) / running_s
 
-    def take(self, report: Report, now_s: float) -> None:
+    def add(self, report: Report, now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""
         name = report.node
         if not self.has_final_report(name):
@@ -206,13 +207,14 @@ class Processes:
     """Processes that the back end has started, judged by the reports of their nodes.
 
     Attributes:
-        killed: the names of all nodes whose processes were killed, or are to be.
+        failed: the nodes that have reported that they failed: their processes may end.
+        killed: the nodes whose processes were killed, or are to be.
     """
 
     _detector: StallDetector
     _outcome: Outcome
     _running: list[RunningNode] = field(default_factory=list)
-    _has_told_failure: set[str] = field(default_factory=set)
+    failed: set[str] = field(default_factory=set)
     killed: set[str] = field(default_factory=set)
 
     def add(self, started: Sequence[RunningNode]) -> None:
@@ -224,10 +226,6 @@ class Processes:
 
     def __iter__(self) -> Iterator[RunningNode]:
         return iter(tuple(self._running))
-
-    def note_failure(self, name: str) -> None:
-        """A node has told that it failed: its process may end now."""
-        self._has_told_failure.add(name)
 
     def ended(self) -> list[tuple[RunningNode, str]]:
         """Processes that have ended since the last call, and how."""
@@ -252,7 +250,7 @@ class Processes:
     def may_end(self, process: RunningNode, *, is_stopping: bool) -> bool:
         """Whether it was asked to end and has told its last, or has failed and said so."""
         names = set(process.names)
-        if names <= self.killed or names & self._has_told_failure:
+        if names <= self.killed or names & self.failed:
             return True
         return is_stopping and all(map(self._outcome.has_final_report, names))
 
@@ -269,7 +267,7 @@ class Processes:
 
     def how_it_left(self, process: RunningNode, how: str) -> str:
         """One sentence about a process that ended badly after its final report, else empty."""
-        if how == "exit code 0" or {*process.names} & (self.killed | self._has_told_failure):
+        if how == "exit code 0" or {*process.names} & (self.killed | self.failed):
             return ""
         return f"the process of {nodes_of(process)} ended badly after its final report: {how}"
 

@@ -19,7 +19,7 @@ from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
 from neuros.errors import ControlError, HookError, NeurosError, ProtocolError
 from neuros.hooks import HookKind, HookSpec, hook_specs_of
-from neuros.node.context import ContextSwitch
+from neuros.node.context import Context, ContextSwitch
 from neuros.node.failures import Failures
 from neuros.node.handle import NodeHandle, PluginServices, Results
 from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Tap
@@ -157,9 +157,10 @@ class NodeRuntime:
             self.failures,
             self._time,
             instruments,
-            enter=self._enter,
-            on_ready=self._note_ready,
-            on_initialised=self._note_initialised,
+            contexts=contexts,
+            context=self._context,
+            on_ready=self._on_ready,
+            on_initialised=self._on_hook_initialised,
         )
         world_log = None if recorder is None else WorldLog(self.run_dir, self._logger)
         self.reports = NodeReports(
@@ -183,7 +184,7 @@ class NodeRuntime:
     @property
     def has_context(self) -> bool:
         """Whether the context of this node is in place now."""
-        return self._contexts.has(self._context)
+        return self._contexts.current is self._context
 
     @property
     def sim_time(self) -> float | None:
@@ -310,7 +311,12 @@ class NodeRuntime:
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let the hooks that drive the project start so many times more."""
-        self._guard(lambda: self._loaded.step(count, is_driven=is_driven))
+        engine = self.engine
+        assert engine is not None
+        try:
+            engine.step(count, is_driven=is_driven)
+        except NeurosError as error:
+            self.failures.report(error)
 
     def stop(self) -> None:
         """Start no further hook. Any thread."""
@@ -350,7 +356,7 @@ class NodeRuntime:
         """A packet has arrived on an external topic."""
         for observe in self._heard[port.name].observers:
             observe(packet, None)
-        self._guard(lambda: self._loaded.on_packet(port.name, packet))
+        self._guard(partial(self._loaded.on_packet, port.name, packet))
 
     def deliver(self, input_name: str, data: bytes) -> None:
         """An observer sends a packet to an input of the session.
@@ -408,7 +414,19 @@ class NodeRuntime:
     def _make(self) -> Engine:
         """The engine for the hooks of now."""
         node = self.file.node
-        types = {port.name: self._packet_type(port) for port in node.outputs}
+        packets = self._middleware.packets
+        jpegs = {
+            c.source_output
+            for c in self.file.connections
+            if c.is_jpeg and c.source_node == self.name
+        }
+        types = {
+            port.name: PacketType(
+                packets.packet_class(port.type),
+                packets.checker(port.type, for_jpeg=port.name in jpegs),
+            )
+            for port in node.outputs
+        }
         self.engine = self._services.engine = self._make_engine(
             node, self.file.connections, self.specs, self._effects, self._clock, types
         )
@@ -418,16 +436,16 @@ class NodeRuntime:
         self._uninitialised = sum(spec.kind is HookKind.INITIALISE for spec in self.specs)
         return self.engine
 
-    def _note_ready(self) -> None:
-        self._settle()
+    def _on_ready(self) -> None:
+        self._restore()
         self._tell(Ready(self.name))
 
-    def _note_initialised(self) -> None:
+    def _on_hook_initialised(self) -> None:
         self._uninitialised -= 1
-        self._settle()
+        self._restore()
         self._on_initialised()
 
-    def _settle(self) -> None:
+    def _restore(self) -> None:
         """Put what waits into values that were kept, once all initialise hooks have run."""
         if not self._uninitialised:
             self.keeping.settle()
@@ -450,13 +468,6 @@ class NodeRuntime:
     @property
     def _resets(self) -> list[HookSpec]:
         return [spec for spec in self._plugin if spec.kind is HookKind.RESET]
-
-    def _packet_type(self, port: Port) -> PacketType:
-        packets = self._middleware.packets
-        own = [c for c in self.file.connections if c.source_node == self.file.node.name]
-        for_jpeg = any(c.is_jpeg for c in own if c.source_output == port.name)
-        check = packets.checker(port.type, for_jpeg=for_jpeg)
-        return PacketType(packets.packet_class(port.type), check)
 
     @property
     def _loaded(self) -> Engine:
@@ -483,7 +494,7 @@ class NodeEffects:
     """The :class:`~neuros.engine.engine.Effects` of one running node.
 
     Args:
-        enter: puts the context of the node in place.
+        contexts, context: the context of the node, and what puts it in place.
         instruments: what looks at packets, in this order.
         on_ready: called once the node waits for all others to become ready.
         on_initialised: called after each initialise hook.
@@ -500,7 +511,8 @@ class NodeEffects:
         time: SimulatedTime,
         instruments: Sequence[Instrument],
         *,
-        enter: Callable[[], None],
+        contexts: ContextSwitch,
+        context: Context,
         on_ready: Callable[[], object],
         on_initialised: Callable[[], None],
     ) -> None:
@@ -518,7 +530,7 @@ class NodeEffects:
         self._instruments = instruments
         self._sent: dict[str, Tap] = {}
         self._taps_to_itself: dict[Connection, Tap] = {}
-        self._enter = enter
+        self._contexts, self._context = contexts, context
         self.note_ready = on_ready
         self._on_initialised = on_initialised
 
@@ -535,7 +547,8 @@ class NodeEffects:
         Raises:
             HookError: if it raises any exception.
         """
-        self._enter()
+        if self._contexts.current is not self._context:
+            self._contexts.enter(self._context)
         spec = hook.spec
         try:
             result = spec.function(self._handle, *arguments)
@@ -575,7 +588,7 @@ class NodeEffects:
         elif connections:
             transmit = self._transport.sender(connections)
         elif tap.observers:
-            transmit = _to_nobody
+            transmit = lambda _: None  # noqa: E731 - of an output that nothing is connected to
         else:
             return None
 
@@ -631,10 +644,6 @@ class VirtualEffects(NodeEffects):
                 "the plugin has made a subscription, timer, service or client of ROS, which are"
                 " called in real time: use inputs and hooks, or run in real time"
             )
-
-
-def _to_nobody(packet: Any) -> None:
-    """Send a packet of an output that nothing is connected to."""
 
 
 def _hook_error(spec: HookSpec, error: BaseException) -> HookError:

@@ -65,7 +65,9 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
             raise PluginError(
                 f"{path}: there is no {error.name}: {_GONE_MODULES[error.name]}"
             ) from error
-        line = f":{error.lineno}" if _is_syntax_error_in(error, path) else ""
+        line = ""
+        if isinstance(error, SyntaxError) and error.filename == str(path):
+            line = f":{error.lineno}"
         raise PluginError(
             f"{path}{line}: cannot be imported: {describe(error)}\n{plugin_traceback(error, path)}"
         ) from error
@@ -86,10 +88,6 @@ def no_module(name: str) -> PluginError:
         f"there is no module {name} for {sys.executable}: its package goes into the"
         " requirements.txt of the node's container: docs/plugins.md"
     )
-
-
-def _is_syntax_error_in(error: BaseException, path: Path) -> TypeGuard[SyntaxError]:
-    return isinstance(error, SyntaxError) and error.filename == str(path)
 
 
 def describe(error: BaseException) -> str:

@@ -107,9 +107,9 @@ class SimulatedTime:
 
     def look(self) -> None:
         """It may have gone on; it may be over."""
-        time_s = self.now_s
-        if time_s is None:
+        if self._read_s is None:
             return
+        time_s = self._read_s()
         self._timeline.note(time_s, self._clock() / 1e9)
         if self._duration_s is not None and self.is_over and not self._has_told:
             self._has_told = True

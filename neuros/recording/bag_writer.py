@@ -20,7 +20,7 @@ from rosbags.typesys.store import Typestore
 
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault
-from neuros.ordinary_files import folder_in, write_whole
+from neuros.ordinary_files import write_whole
 from neuros.project.message_types import message_folder, normalised
 from neuros.recording.recording_plan import Topic
 
@@ -86,8 +86,7 @@ class BagWriter:
         path.mkdir(parents=True)
         self.counts: dict[int, int] = {}
         self._path, self._custom = path, dict(custom)
-        with folder_in(path.parent, path.name) as folder:
-            self._file = (folder / f"{path.name}.mcap").open("xb")
+        self._file = (path / f"{path.name}.mcap").open("xb")
         # Compression of images took 2.7 times the processor time, for 0.6 times the size.
         self._mcap = Writer(self._file, compression=CompressionType.NONE)
         self._mcap.start("ros2", f"neuros-{__version__}")
@@ -175,8 +174,7 @@ class BagWriter:
             self._mcap.finish()
             self._file.close()
             text = _yaml({"rosbag2_bagfile_information": information})
-            with folder_in(self._path.parent, self._path.name) as folder:
-                write_whole(folder / "metadata.yaml", f"{text}\n".encode())
+            write_whole(self._path / "metadata.yaml", f"{text}\n".encode())
         finally:
             self.shut()
 

@@ -21,7 +21,7 @@ from neuros.control import Message, Shutdown
 from neuros.distribution import WORKSPACE
 from neuros.engine.engine import Engine
 from neuros.engine.send_window import SendWindow
-from neuros.engine.snapshot import snapshot
+from neuros.engine.snapshot import explain, snapshot
 from neuros.errors import NeurosError, NodeError, ProjectError
 from neuros.installation.progress import Progress
 from neuros.messages.needed import Messages
@@ -447,7 +447,7 @@ class PluginHarness:
 
     def explain(self) -> list[str]:
         """Why nothing moves, in the words of the stall explainer."""
-        return self._runtime.reports.explain()
+        return explain(self._engine, self._clock())
 
     # ------------------------------------------------------------------ what goes in
 

@@ -14,17 +14,15 @@ from neuros.control import (
     TO_OBSERVERS,
     End,
     Ended,
+    GetStatus,
     Hello,
     LogRecord,
-    Look,
-    LookAll,
     Message,
     NodeStatus,
     Pause,
     PhaseChanged,
     Resume,
     Step,
-    StepAll,
     Watch,
 )
 from neuros.control.link import ControlLink
@@ -61,7 +59,7 @@ class Run:
             self.channels.wait(5.0)
             for lines, message in self.channels.receive():
                 assert not isinstance(message, ControlError)
-                self.observers.take(lines, message)
+                self.observers.receive(lines, message)
                 count -= 1
 
 
@@ -105,14 +103,14 @@ def test_what_nodes_show_goes_to_the_observer_that_asked(run: Run) -> None:
         observer.send(Watch())
         run.hear()
     for observer, wanted in ((first, {"a": {"x": {}}}), (second, {})):
-        observer.send(LookAll({"b": {}}))
-        observer.send(LookAll(wanted))  # takes the place of what was not asked yet
+        observer.send(GetStatus({"b": {}}))
+        observer.send(GetStatus(wanted))  # takes the place of what was not asked yet
         run.hear(2)
     run.observers.look_at(Phase.RUNNING)
     looks = told(node, 2)
-    assert looks == [Look({"a": {"x": {}}}, 1), Look({}, 2)]
+    assert looks == [GetStatus({"a": {"x": {}}}, 1), GetStatus({}, 2)]
     for look in looks:
-        assert isinstance(look, Look)
+        assert isinstance(look, GetStatus)
         samples = {port: dict(each) for port, each in look.wanted.get("a", {}).items()}
         node.send(NodeStatus("a", look.asker, samples=samples))
     run.hear(2)
@@ -133,11 +131,11 @@ def test_pause_step_and_resume_reach_the_nodes_and_time_is_kept(run: Run) -> Non
     observer.send(Watch())
     run.hear()
     for message in (
-        StepAll(1),  # it is not paused: nothing happens
+        Step(1),  # it is not paused: nothing happens
         Pause(),
         Pause(),
-        StepAll(3),
-        StepAll(-1),
+        Step(3),
+        Step(-1),
     ):
         observer.send(message)
     run.hear(5)

@@ -33,6 +33,7 @@ class Mutant:
 _begin_if_registered = Lifecycle._begin_if_registered
 _start = Lifecycle.start
 _subscription = Subscription.__init__
+_put = Subscription.put
 
 
 def _begin_at_once(lifecycle: Lifecycle) -> None:
@@ -48,8 +49,10 @@ def _spend_without_window(window: SendWindow, now_ns: int) -> None:
     window.sent += 1
 
 
-def _last_received(subscription: Subscription, queue: InputQueue | None = None) -> int:
-    return subscription.received
+def _acknowledges_on_arrival(subscription: Subscription, arrival: int, packet: Any) -> None:
+    _put(subscription, arrival, packet)
+    if subscription.is_acknowledged:
+        subscription.acknowledge(subscription.received)
 
 
 def _position_of_the_first(subscription: Subscription, queue: InputQueue | None = None) -> int:
@@ -84,7 +87,7 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "a packet is acknowledged when a hook starts on it, and not before",
         "a longer queue for a slow taker",
-        lambda: patch.object(Subscription, "position_if_consumed", _last_received),
+        lambda: patch.object(Subscription, "put", _acknowledges_on_arrival),
     ),
     Mutant(
         "a packet is acknowledged when every taker has started on it",

@@ -364,7 +364,7 @@ class World:
 
     def take_answer(self, answer: Probed) -> None:
         """A node has answered a probe."""
-        self.probing.take(answer)
+        self.probing.add(answer)
         if self.probing.verdict is Verdict.DRAINED and not self.is_drained:
             self._end_drained()
 

