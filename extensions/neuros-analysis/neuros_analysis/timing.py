@@ -27,6 +27,7 @@ from neuros.api.packets import (
 )
 from neuros.api.run_record import PastRun, open_run, open_whole
 from neuros.distribution import __version__
+from neuros.engine.schedule import MOST_EXECUTIONS
 from neuros.errors import UsageError
 from neuros.project.model import Connection
 from neuros.project.timing import LEAST_DELAY_NS, MOST_NS, VIRTUAL, Distribution
@@ -40,6 +41,7 @@ MOST_SAMPLES = 1000
 ENOUGH = 30
 """Where fewer packets show the delay, so many acknowledgements do."""
 
+_NEVER = 2**63 - 1
 _MOST_WINDOWS, _OF_A_WINDOW = 16, 20
 
 
@@ -403,17 +405,21 @@ class _Lists:
             self.flights_ns[name] = self._flights_ns(name) if is_common else None
 
     def _busy_until(self, node: str, at_ns: Numbers) -> Numbers:
-        """The latest end of the hooks that had started in the thread of a node before each time."""
+        """The latest end of the hooks that had started in the thread of a node before each time.
+
+        Without end (``_NEVER``) once one of the nodes that share the thread lists no more hooks.
+        """
         process = self._process_of[node]
         if process not in self._processes:
             traces = [t for n, t in self.traces.items() if self._process_of[n] == process]
-            starts_ns = np.concatenate([trace.starts_ns for trace in traces])
-            ends_ns = np.concatenate([trace.ends_ns for trace in traces])
+            full = (t.ends_ns for t in traces if len(t.ends_ns) >= MOST_EXECUTIONS)
+            until_ns = min((ends_ns[-1] for ends_ns in full), default=_NEVER)
+            starts_ns = np.concatenate([[0], *(trace.starts_ns for trace in traces), [until_ns]])
+            ends_ns = np.concatenate([[0], *(trace.ends_ns for trace in traces), [_NEVER]])
             order = np.argsort(starts_ns, kind="stable")
-            ends_ns = np.maximum.accumulate(ends_ns[order]) if len(order) else ends_ns
-            self._processes[process] = starts_ns[order], np.insert(ends_ns, 0, 0)
+            self._processes[process] = starts_ns[order], np.maximum.accumulate(ends_ns[order])
         starts_ns, ends_ns = self._processes[process]
-        found: Numbers = ends_ns[np.searchsorted(starts_ns, at_ns)]
+        found: Numbers = ends_ns[np.maximum(np.searchsorted(starts_ns, at_ns), 1) - 1]
         return found
 
     def _starts_on_packets(self, node: str) -> tuple[Numbers, Numbers]:

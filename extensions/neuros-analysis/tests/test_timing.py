@@ -16,6 +16,7 @@ from neuros_analysis.timing import ENOUGH, MOST_SAMPLES, Measured, by_chance, di
 from run_folders import accounting, run_folder
 
 from neuros.cli.main import main
+from neuros.engine.schedule import MOST_EXECUTIONS
 from neuros.errors import UsageError
 from neuros.project.validate import mistake
 
@@ -204,6 +205,18 @@ def test_in_one_process_hooks_of_other_nodes_keep_a_receiver_busy(
     lists.execute("a.send", sent_ns + 50 * MS, sent_ns + 50 * MS)
     folder = lists.write(tmp_path, {WIRE: None}, is_one_process=is_one_process)
     assert len(measure(folder).connections[WIRE].values_s) == count
+
+
+def test_once_a_node_lists_no_more_hooks_nobody_in_its_process_counts_as_free(
+    tmp_path: Path,
+) -> None:
+    lists = free()
+    middle_ns = lists.taken[WIRE][20][1] + 10 * MS
+    for number in range(MOST_EXECUTIONS):
+        at_ns = middle_ns - MOST_EXECUTIONS + number
+        lists.execute("c.quick", at_ns, at_ns)
+    delay = measure(lists.write(tmp_path, {WIRE: None}, is_one_process=True)).connections[WIRE]
+    assert len(delay.values_s) == 21
 
 
 def test_initialise_hooks_and_threads_of_simulators_have_no_duration(tmp_path: Path) -> None:
