@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from neuros_analysis.timing import ENOUGH, MOST_SAMPLES, Measured, by_chance, distance, measure
 from run_folders import accounting, run_folder
@@ -106,6 +106,7 @@ times_ns = st.integers(1000, 50 * MS)
 packets = st.lists(st.tuples(times_ns, times_ns, times_ns), min_size=ENOUGH, max_size=80)
 
 
+@settings(max_examples=40)
 @given(packets)
 def test_the_delay_is_that_of_packets_that_found_their_receiver_free(
     tmp_path_factory: pytest.TempPathFactory, packets: list[tuple[int, int, int]]
@@ -300,6 +301,7 @@ LISTS += ("a/packets/0.sent_ns", "b/packets/0.taken", "b/packets/0.taken_ns")
 numbers = st.lists(st.integers(0, 1) | st.integers(-(2**63), 2**63 - 1), max_size=40)
 
 
+@settings(max_examples=40)
 @given(st.sampled_from(LISTS), numbers)
 def test_damaged_lists_give_what_a_file_can_have(
     tmp_path_factory: pytest.TempPathFactory, file: str, numbers: list[int]
