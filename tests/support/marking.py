@@ -51,6 +51,7 @@ BY_NAME = {
         "extensions/neuros-analysis/tests/test_report.py",
         "extensions/neuros-analysis/tests/test_spike_trains.py",
         "extensions/neuros-analysis/tests/test_sweep.py",
+        "extensions/neuros-analysis/tests/test_timing_of_runs.py",
         "extensions/neuros-cluster/tests/test_charliecloud.py",
         "extensions/neuros-cluster/tests/test_deployment.py",
         "extensions/neuros-cluster/tests/test_deployment_by_ssh.py",
