@@ -300,6 +300,7 @@ def load_project(
         budgets=Budgets(**{**budgets, "lost_packets": lost}),
         names=names,
         dashboard=dashboard_of(parsed),
+        is_portable=parsed.root.plain.get("portable", False),
     )
     loose = [*unconnected_ports(parsed)]
     told = (*sorted([*remarks(parsed), *loose]), *doubts)
