@@ -69,6 +69,13 @@ class TestIntegrator:
         assert network.steps_s == pytest.approx([0.02, 0.02])
         assert heading == pytest.approx(100 * 0.02 * 0.5)
 
+    def test_without_bridges_a_packet_that_was_lost_is_lost_angle(self, load):
+        network = FakeNetwork()
+        integrator = load("snn").GyroIntegrator(network, bridges=False)
+        integrator.integrate(PERIOD_NS, 0.5)
+        assert integrator.integrate(100 * PERIOD_NS, 0.5) == pytest.approx(2 * 0.02 * 0.5)
+        assert network.steps_s == pytest.approx([0.02, 0.02])
+
     def test_without_a_gap_the_heading_is_the_networks_own_bit_for_bit(self, load):
         network = FakeNetwork()
         integrator = load("snn").GyroIntegrator(network)
