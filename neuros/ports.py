@@ -97,8 +97,8 @@ class Packets(Protocol):
     def packet_class(self, type_name: str) -> type:
         """The message class of a type, or NumPy's array. Raises ``EnvironmentFault``."""
 
-    def make(self, type_name: str) -> Packet:
-        """A new message with default values, or an array of zeros."""
+    def maker(self, type_name: str) -> Callable[[], Packet]:
+        """A function that makes a new message with default values, or an array of zeros."""
 
     def checker(self, type_name: str, *, for_jpeg: bool = False) -> Callable[[Packet], Packet]:
         """A check of packets of a type, also for JPEG.
@@ -141,7 +141,30 @@ class PacketRecorder(Protocol):
         """End the recording."""
 
 
-class EventLoop(Protocol):
+class NodeEvents(Protocol):
+    """The events of a node, or of all nodes of a process.
+
+    Attributes:
+        clock: monotonic clock in nanoseconds.
+    """
+
+    @property
+    def clock(self) -> Callable[[], int]: ...
+
+    def post(self, event: Callable[[], None]) -> None:
+        """Handle ``event`` after all waiting events. Loop thread only."""
+
+    def post_loop_back(self, event: Callable[[], None]) -> None:
+        """As :meth:`post`, also after all events that wait in ROS."""
+
+    def post_from_thread(self, event: Callable[[], None]) -> None:
+        """As :meth:`post`, from any thread; wakes the loop."""
+
+    def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Callable[[], None]) -> None:
+        """Call ``on_due`` whenever the clock reaches ``next_due_ns()``."""
+
+
+class EventLoop(NodeEvents, Protocol):
     """The thread of all nodes of a process: one event at a time, oldest first."""
 
     @property
@@ -155,23 +178,67 @@ class EventLoop(Protocol):
     def note_execution(self) -> None:
         """A hook, or a callback of a plugin, has ended; packets may have arrived meanwhile."""
 
-    def post(self, event: Callable[[], None]) -> None:
-        """Handle ``event`` after all waiting events. Loop thread only."""
-
-    def post_loop_back(self, event: Callable[[], None]) -> None:
-        """As :meth:`post`, also after all events that wait in ROS."""
-
-    def post_from_thread(self, event: Callable[[], None]) -> None:
-        """As :meth:`post`, from any thread; wakes the loop."""
-
-    def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Callable[[], None]) -> None:
-        """Call ``on_due`` whenever the monotonic clock reaches ``next_due_ns()``."""
-
     def run(self) -> None:
         """Handle events until :meth:`stop`."""
 
     def stop(self) -> None:
         """End :meth:`run` after the current event. Any thread."""
+
+
+class NodeLoop(NodeEvents, Protocol):
+    """The clock and the events of one node in virtual time.
+
+    Attributes:
+        seed: from which durations, delays and losses are drawn.
+        zero_ns: time 0 of the run.
+        starts: how many hooks have started at this instant.
+    """
+
+    starts: int
+
+    @property
+    def seed(self) -> str: ...
+    @property
+    def zero_ns(self) -> int: ...
+
+    def announce(self, duration_ns: int) -> None:
+        """The hook that starts now takes at least so long."""
+
+    def ready(self) -> None:
+        """The initialise hooks have run, but for those that wait for packets."""
+
+    def at_zero(self, event: Callable[[], None], first_pass: Callable[[], None]) -> None:
+        """Handle two events at time 0 of the run; the second after the first of all nodes."""
+
+    def hold(self, duration_ns: int) -> None:
+        """The hook that has just run takes so long."""
+
+    def at(self, time_ns: int, event: Callable[[], None]) -> None:
+        """Handle an event at a time, or now if that has passed."""
+
+    def begin(self) -> None:
+        """Time 0 of the run has come."""
+
+    def end(self, drain_s: float) -> None:
+        """The node asks for the end: nothing happens after this instant until :meth:`drain`."""
+
+    def drain(self, event: Callable[[], None], stop: Callable[[], None], *, is_asked: bool) -> None:
+        """Handle ``event`` when the end reaches the node; ``stop`` it if it drains for too long.
+
+        ``is_asked``: a node has asked for the end; else it is now.
+        """
+
+
+class VirtualRun(EventLoop, Protocol):
+    """The loop of a process in virtual time."""
+
+    def plan(
+        self,
+        duration_s: float | None,
+        on_end: Callable[[], None],
+        real_time_factor: float | None,
+    ) -> None:
+        """Call ``on_end`` at the end of a duration from time 0; go no faster than the factor."""
 
 
 class Voice(Protocol):
@@ -192,6 +259,14 @@ class Middleware(Protocol):
 
     @property
     def packets(self) -> Packets: ...
+
+    def loop_of(self, file: NodeFile) -> NodeEvents:
+        """The clock and the events of one node."""
+
+    def begin_anew(
+        self, files: Sequence[NodeFile], variables: Mapping[str, Mapping[str, str]]
+    ) -> None:
+        """All nodes are about to be reset, with these variables in their environments."""
 
     def transport(self, file: NodeFile) -> Transport:
         """The transport of one node; creates its ROS node."""
@@ -261,8 +336,32 @@ WorldLook: TypeAlias = "Callable[[Mapping[str, Any], int], Mapping[str, Any]]"
 """A view of a simulated world, for JSON, by the observer's request and number. Any thread."""
 
 
+class VirtualClock(Protocol):
+    """The clock of a run in virtual time, for a simulator that steps itself."""
+
+    def clock_s(self) -> float:
+        """Seconds since time 0 of the run."""
+
+    def when_active(self, event: Callable[[], None]) -> None:
+        """Call ``event`` at time 0 of the run, or now if that has passed."""
+
+    def call_at(self, time_s: float, event: Callable[[], None]) -> None:
+        """Call ``event`` so many seconds after time 0, or now if that has passed."""
+
+    def send(self, packets: Mapping[str, Packet], sent: Callable[[], None]) -> None:
+        """Send packets, by output, as soon as a hook could; then call ``sent``."""
+
+
+Advance: TypeAlias = "Callable[[], Mapping[str, Packet]]"
+"""Steps a world that runs by itself, to packets that are due or less far; returns them."""
+
+
 class NodeContext(Protocol):
     """The node handle of hooks, as far as simulators need it."""
+
+    @property
+    def virtual_time(self) -> VirtualClock | None:
+        """The clock of a run in virtual time; ``None`` in real time."""
 
     @property
     def name(self) -> str:
@@ -302,6 +401,12 @@ class NodeContext(Protocol):
     def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
         """Wait for time 0 of the run; False if ``cancelled()`` or the node ends. Other threads."""
 
+    def reading(self, value: int) -> int:
+        """A reading of what goes on by itself: that of the run in a replay, else the value."""
+
+    def drive(self, advance: Advance) -> bool:
+        """Whether the node advances a world that runs by itself, so that no thread has to."""
+
     def show_world(self, look: WorldLook) -> None:
         """Show a simulated world to observers; see :mod:`neuros.simulators.mujoco.scene`."""
 
@@ -313,6 +418,13 @@ class NodeContext(Protocol):
 
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
+
+    def on_change(
+        self,
+        callback: Callable[[], object],
+        check: Callable[[Mapping[str, str]], object] = lambda _: None,
+    ) -> None:
+        """Call ``callback`` when a fork has changed the environment, and ``check`` before."""
 
     def fail(self, error: BaseException) -> None:
         """End the node with an error from outside of hooks. Any thread."""

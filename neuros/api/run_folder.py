@@ -39,7 +39,7 @@ from neuros.distribution import WORKSPACE, __version__, python_command
 from neuros.errors import UsageError
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_text, project_to_json
-from neuros.recording.provenance import seeds
+from neuros.project.timing import seeds
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, plan_recording
 from neuros.recording.run_file import RUN_FILE, write_run_file
 
@@ -255,7 +255,7 @@ def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None
         plan.names,
         wanted,
         is_alone=not is_open and "ROS_DOMAIN_ID" not in environ,
-        custom=_custom_data(plan.project),
+        custom={**_custom_data(plan.project), "backend": plan.back_end.name},
     )
 
 
@@ -291,6 +291,7 @@ def _custom_data(project: Project) -> dict[str, str]:
             continue
     return {
         "project": project.name,
+        "file": str(project.file),
         "project_sha256": hashlib.sha256(content.encode()).hexdigest(),
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "versions": json.dumps(versions),
