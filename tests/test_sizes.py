@@ -28,15 +28,15 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 51_100)
+    hold("lines of neuros/", lines(NEUROS), 52_120)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 64_950)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 65_960)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 84_720)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 85_750)
 
 
 def test_private_functions_that_are_used_once() -> None:
