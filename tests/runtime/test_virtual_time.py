@@ -459,10 +459,10 @@ def ticking(folder: Path, **keys: Any) -> neuros.Project:
     return neuros.Project([neuros.Node("a", "p.py")], folder=folder, **keys)
 
 
-def test_a_back_end_of_several_processes_is_refused(tmp_path: Path) -> None:
+def test_nodes_elsewhere_are_refused(tmp_path: Path) -> None:
     described = ticking(tmp_path, time="virtual")
-    with pytest.raises(UsageError, match="use --backend in-process"):
-        described.run(backend="process", duration=1)
+    with pytest.raises(UsageError, match="--network: nodes elsewhere are in real time"):
+        described.run(backend="in-process", duration=1, network=True)
 
 
 def test_a_pace_of_real_time_is_refused(tmp_path: Path) -> None:
