@@ -121,6 +121,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "cli.main": {"argcomplete"},
     "cli.template": {"std_msgs"},
     "cli.live": {"tabulate"},
+    "cli.replay": {"tabulate"},
     "cli.runs": {"tabulate"},
     "replay.replayed_node": {"debugpy"},
     "node.copies": {"numpy"},

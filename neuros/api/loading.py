@@ -42,7 +42,7 @@ _LONG_BYTES = 1 << 20
 """Larger files in the folder of a container are data, not a recipe."""
 _CLOSE = 0.8  # similarity in difflib's scale, as of besides and beside
 _MJCF = (".xml", ".mjcf")
-_MODELS = (*_MJCF, ".urdf", ".sdf", ".world")
+_MODELS = (*_MJCF, ".urdf", ".xacro", ".sdf", ".world")
 _PLACE = re.compile(r"(\S.*?):(\d+):(\d+): (.*)")
 _LINE = re.compile(r"\bline (?:number=)?(\d+)", re.IGNORECASE)
 

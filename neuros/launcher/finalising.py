@@ -41,12 +41,12 @@ class FinaliseTimes:
         self._left[node] = list(hooks)
 
     def begin(self, now_s: float) -> None:
-        """The nodes have been told to end."""
+        """The nodes have been asked to end."""
         for name in self.limits_s:
             self._moved_s.setdefault(name, now_s)
             self._looked_s.setdefault(name, now_s)  # what nodes write as they are told is no news
 
-    def excuse(self, still_s: float) -> None:
+    def shift(self, still_s: float) -> None:
         """The run stood still for so long."""
         self._moved_s = {name: moved_s + still_s for name, moved_s in self._moved_s.items()}
 
@@ -75,7 +75,7 @@ class FinaliseTimes:
         current = self.current(names)
         waiting = [current] if current else names
         for name in waiting:
-            self._look_at_files(name, now_s)
+            self._check_files(name, now_s)
         return max(self._moved_s[name] + self.limits_s[name] for name in waiting) - now_s
 
     def unfinished(self, node: str) -> list[str]:
@@ -93,14 +93,14 @@ class FinaliseTimes:
         return clauses
 
     def remarks(self, now_s: float) -> Iterator[str]:
-        """What takes long now, each once."""
+        """Sentences about nodes that have finalised for a second, each once."""
         for node, hook in self._hooks.items():
             is_long = hook is not None and now_s - self._since_s[node] >= SAVING_S
             if hook is not None and is_long and (node, hook) not in self._named:
                 self._named.add((node, hook))
                 yield f"saving: '{node}' ({f'finalise hook {hook!r}' if hook else 'closing'})"
 
-    def _look_at_files(self, node: str, now_s: float) -> None:
+    def _check_files(self, node: str, now_s: float) -> None:
         """Count it as progress if a file of the node has grown since the last look."""
         if now_s - self._looked_s.get(node, 0.0) < min(_LOOK_S, self.limits_s[node] / 4):
             return

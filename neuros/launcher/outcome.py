@@ -151,7 +151,7 @@ class Outcome:
             self.timelines.setdefault(name, []).extend(report.timeline)
             self.report_times_s[name] = now_s
 
-    def excuse(self, still_s: float) -> None:
+    def shift(self, still_s: float) -> None:
         """The launcher stood still for so long, and perhaps the nodes: their reports are as new."""
         self.report_times_s = {n: at_s + still_s for n, at_s in self.report_times_s.items()}
 
@@ -184,7 +184,7 @@ class Outcome:
 def _advance(
     timeline: Sequence[Sequence[float]], start_s: float, end: tuple[float, float]
 ) -> float:
-    """The simulated time that has passed since a wall time; what a reset takes back has passed."""
+    """The simulated seconds since a wall time; a reset takes none of them back."""
     after = bisect_right(timeline, start_s, key=lambda point: point[1])
     points = [(_simulated(timeline, start_s), start_s), *timeline[after:], end]
     return sum(max(0.0, later[0] - earlier[0]) for earlier, later in pairwise(points))
@@ -242,13 +242,8 @@ class Processes:
         """The process with a node, if it runs."""
         return next((each for each in self._running if name in each.names), None)
 
-    def have_reported(self) -> bool:
-        """Whether every node has made its final report, but for those that were killed."""
-        names = {name for process in self._running for name in process.names}
-        return all(map(self._outcome.has_final_report, names - self.killed))
-
     def may_end(self, process: RunningNode, *, is_stopping: bool) -> bool:
-        """Whether it was asked to end and has told its last, or has failed and said so."""
+        """Whether its nodes have made their final reports, or have reported a failure."""
         names = set(process.names)
         if names <= self.killed or names & self.failed:
             return True

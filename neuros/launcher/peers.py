@@ -121,7 +121,7 @@ class EndElsewhere(NamedTuple):
 
 
 class Peers:
-    """The peers of this launcher, and what it tells them.
+    """The peers of this launcher: their states, and its own.
 
     Args:
         run: marks this run.
@@ -175,12 +175,12 @@ class Peers:
         return self._own.to_text()
 
     def reach(self, stage: Stage) -> None:
-        """The nodes here have come so far in their start."""
+        """The nodes here have reached a stage of the start."""
         if self._own.stage < stage:
             self._publish(stage=stage)
 
     def have_reached(self, stage: Stage) -> bool:
-        """Whether every node elsewhere has come so far."""
+        """Whether every node elsewhere has reached this stage."""
         return not self._behind(stage)
 
     def drain(self, reason: str, drain_s: float) -> None:
@@ -288,7 +288,7 @@ class Peers:
     # ------------------------------------------------------------------ inside
 
     def _behind(self, stage: int) -> list[str]:
-        """The nodes elsewhere that have not come so far."""
+        """The nodes elsewhere that have not reached this stage."""
         found = {name: self._others[run].stage for name, run in self._run_of.items()}
         return [name for name in self._elsewhere if found.get(name, -1) < stage]
 
@@ -308,7 +308,7 @@ class Peers:
         return {"reason": reason, "origin": self._own.machine, "exit_code": exit_code}
 
     def _unfinished(self) -> bool:
-        """Whether a peer that is there has not said what it has counted in all."""
+        """Whether a peer that is there has not published its final counters."""
         gone = {self._run_of[node] for node in self._gone_s}
         return any(s.phase != OVER and s.run not in gone for s in self._others.values())
 

@@ -102,7 +102,7 @@ class Probing:
             if len(self._probes) == len(self._names):
                 self._judge()
 
-    def look(self, now_s: float, rested_s: float) -> Verdict:
+    def check(self, now_s: float, rested_s: float) -> Verdict:
         """Ask again where it is time; ``rested_s`` is for how long nothing has moved."""
         pause_s = now_s - self._asked_s
         if self._is_draining:

@@ -74,7 +74,7 @@ class StallDetector:
                 self._plugins[name] = plugins[name]
 
     def report(self, report: Report, now_s: float) -> None:
-        """Take a report."""
+        """Add a report."""
         name, metrics = report.node, report.metrics
         self._reports[name] = report
         self._heard_s[name] = now_s
@@ -99,7 +99,7 @@ class StallDetector:
             self._starving[name] = lacks, now_s
 
     def is_greeted(self, name: str) -> bool:
-        """Whether the process of a node has said hello."""
+        """Whether the process of a node has connected."""
         return name not in self._silent
 
     def has_begun(self, name: str) -> bool:
@@ -123,8 +123,8 @@ class StallDetector:
         self._has_explained = False
         self._starving.clear()
 
-    def excuse(self, still_s: float) -> None:
-        """Nobody could be heard for so long: that is no silence and no standstill of a node."""
+    def shift(self, still_s: float) -> None:
+        """The launcher stood still for so long: that was no silence or standstill of a node."""
         self._heard_s = {name: heard_s + still_s for name, heard_s in self._heard_s.items()}
         self._moved_s += still_s
         self._next_remark_s += still_s
@@ -216,7 +216,7 @@ class StallDetector:
                 yield "WARN", remark
 
     def _remark_on_import(self, names: Sequence[str], read: ProcessThreads) -> str:
-        """What a process does whose main thread lets no other run before its nodes have begun."""
+        """A sentence about a process whose main thread, as it imports, lets no other thread run."""
         holder = read.lock_holder
         loading = [n for n in names if n not in self.loaded and not self.has_begun(n)]
         stacks = filter(None, map(self._read_stack, names))
@@ -233,7 +233,7 @@ class StallDetector:
         )
 
     def _remark_on(self, names: Sequence[str], read: ProcessThreads) -> str:
-        """Why a process with these nodes does not report; empty if that has been said."""
+        """Why a process with these nodes does not report; empty if its hook was named before."""
         holder = read.lock_holder
         if holder and holder.is_main and not read.stopped:
             for stack in filter(None, map(self._read_stack, names)):
@@ -368,7 +368,7 @@ class Backlog:
         self._named: set[str] = set()
 
     def report(self, report: Report, now_s: float) -> None:
-        """Take a report of a node."""
+        """Add a report of a node."""
         metrics = report.metrics
         if metrics is None:
             return

@@ -23,7 +23,7 @@ import neuros.control as control
 from neuros.control import Message, Report
 from neuros.control.link import ControlLink
 from neuros.errors import ControlError
-from neuros.launcher.channels import Channels, Observers, PauseState, Settling
+from neuros.launcher.channels import Channels, Observers, PauseState, RestDetector
 from neuros.launcher.finalising import LEAVE_S, FinaliseTimes
 from neuros.launcher.outcome import (
     EXIT_CODES,
@@ -147,7 +147,7 @@ class Supervisor:
         self._declarations = Declarations(files)
         limits_s = {file.node.name: finalise_s or file.node.finalise_s for file in files}
         self._finalising = FinaliseTimes(limits_s, run_folder)
-        self._settling = Settling(self._names, self._channels)
+        self._rest_detector = RestDetector(self._names, self._channels)
         self.pause = PauseState(self._channels.send, time.monotonic)
         if is_held:
             self.pause.begin()
@@ -185,19 +185,18 @@ class Supervisor:
     def run(self) -> Outcome:
         """Start everything and stay until all of it has ended. Raises ``EnvironmentFault``."""
         try:
-            self._handle_signals()  # one may have come before anything was started
+            self._handle_requests()  # one may have come before anything was started
             if self.phase is Phase.STARTING:
                 self._processes.add(self._launcher.start(self._files, self._environment))
             has_shown = True
             self._last_tick_s = time.monotonic()
             while self._processes and not self._is_hopeless:
-                self._channels.wait(min(self._pause_s(has_shown), self._settling.wait_s))
-                self._handle_signals()
-                self._handle_wishes()
+                self._channels.wait(min(self._pause_s(has_shown), self._rest_detector.wait_s))
+                self._handle_requests()
                 self._receive()
                 self._check_processes()
                 self._tick()
-                self._settling.look()
+                self._rest_detector.check()
                 self._channels.flush()
                 has_shown = bool(self._output.poll())
         finally:
@@ -206,7 +205,7 @@ class Supervisor:
                 process.kill()
             self._reader.close()
             self._receive()
-            self.observers.part(self.outcome)
+            self.observers.end(self.outcome)
             self._channels.close()
             self.outcome.elsewhere = self._peers.counters()
             self.outcome.ended_s = time.monotonic()
@@ -224,18 +223,16 @@ class Supervisor:
         self._handle(RunEvent.FAILURE)
 
     def _log(self, severity: str, text: str) -> None:
-        """Tell the user and the observers."""
+        """Log for the user and the observers."""
         self._output.log(severity, text)
         self.observers.tell(control.LogRecord(severity, text))
 
     # ------------------------------------------------------------------ what arrives
 
-    def _handle_signals(self) -> None:
+    def _handle_requests(self) -> None:
+        """End as the user wishes, or the program that has started the run."""
         while self._signals:
             self._handle(RunEvent.SIGNAL, signal.Signals(self._signals.pop(0)))
-
-    def _handle_wishes(self) -> None:
-        """End as the program that has started the run wishes."""
         while self._wishes:
             reason, exit_code = self._wishes.pop(0)
             if not exit_code:
@@ -297,7 +294,7 @@ class Supervisor:
             case control.Shutdown(node, reason, drain_s):
                 because = f": {reason}" if reason else ""
                 why = f"{node} ended the project{because}" if node else reason
-                self._handle(RunEvent.END, why, drain_s, node)
+                self._handle(RunEvent.END, why, drain_s, node, True)
             case control.Failed(node, text):
                 # Of a run that ends well, the failure of a node that was killed does not matter.
                 if self.outcome.failures or node not in self._processes.killed:
@@ -308,12 +305,12 @@ class Supervisor:
                 self._peers.receive(node, text, now_s)
             case control.Advance():
                 self.pause.step(message.rounds, is_driven=self._detector.is_driven)
-                self._settling.ask(link, message)
+                self._rest_detector.ask(link, message)
             case control.AtRest():
                 if self.phase in _BEFORE_END:  # else the session hears of the end
-                    self._settling.add(message)
+                    self._rest_detector.add(message)
             case control.Resume():
-                self._settling.give_up(link)
+                self._rest_detector.give_up(link)
                 self.observers.receive(link, message)
             case control.Interrupt():
                 self._signals.append(signal.SIGINT)
@@ -346,14 +343,14 @@ class Supervisor:
                 )
 
     def _is_cut_off(self, process: RunningNode) -> bool:
-        """Whether a process goes on, though it has hung up and has not told its last."""
+        """Whether a process runs on without its control connection, before its final reports."""
         for names, since_s in self._channels.parted.items():
             if {*names} & {*process.names} and time.monotonic() - since_s > _PARTED_S:
                 return not self._processes.may_end(process, is_stopping=True)
         return False
 
     def _kill(self, processes: Sequence[RunningNode]) -> None:
-        """Kill processes, and tell where their nodes stood."""
+        """Kill processes, and log where their nodes stood."""
         self._begin_to_read(processes)
         self._reader.wait(_READ_S)
         now_s = time.monotonic()
@@ -398,29 +395,24 @@ class Supervisor:
         now_s = time.monotonic()
         still_s, self._last_tick_s = now_s - self._last_tick_s, now_s
         if still_s > _KEPT_STILL_S:  # then the nodes may have been stopped, too
-            self._detector.excuse(still_s)
+            self._detector.shift(still_s)
             self._backlog.begin_anew()
             self._deadline_s += still_s
-            self._finalising.excuse(still_s)
-            self.outcome.excuse(still_s)
+            self._finalising.shift(still_s)
+            self.outcome.shift(still_s)
         if end := self._peers.end(now_s):
             self._handle(RunEvent.ENDED_ELSEWHERE, end)
         self._handle(RunEvent.TICK, now_s)
-        self._keep_pause()
+        self.outcome.is_paused = self.pause.is_on
+        if self.outcome.started_s is not None:
+            self.outcome.paused_s = self.pause.total_s - self._paused_before_s
+        if self.phase is Phase.STOPPING and self.pause.is_on:  # nodes do not go on before they end
+            self.outcome.ending_s = self.pause.since_s
         self._show(self._detector.remarks_on_hooks())
         if self.phase in _BEFORE_STOP:
             self._show(self._detector.remarks_on_silence(now_s, self._processes.killed))
         # To observers, a run that starts is running.
-        self.observers.look_at(Phase.RUNNING if self.phase is Phase.STARTING else self.phase)
-
-    def _keep_pause(self) -> None:
-        """Keep how long the run has stood still; nodes that are stopped meanwhile do not go on."""
-        outcome = self.outcome
-        outcome.is_paused = self.pause.is_on
-        if outcome.started_s is not None:
-            outcome.paused_s = self.pause.total_s - self._paused_before_s
-        if self.phase is Phase.STOPPING and outcome.is_paused:
-            outcome.ending_s = self.pause.since_s
+        self.observers.update(Phase.RUNNING if self.phase is Phase.STARTING else self.phase)
 
     def _show(self, remarks: Iterable[tuple[str, str]]) -> None:
         for severity, text in remarks:
@@ -473,7 +465,7 @@ class Supervisor:
             self._fail(overdue, exit_code=4)
         if self._peers.exist or not self._detector.is_complete:  # then not all can be asked
             return
-        if self._probing.look(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:
+        if self._probing.check(now_s, self._detector.rested_s(now_s)) is Verdict.DEAD:
             self._fail(self._probing.why_dead())
 
     # ------------------------------------------------------------------ draining
@@ -483,10 +475,14 @@ class Supervisor:
             self._end_asked = reason, *details
             self._log("INFO", f"{reason}; the end comes once every node has initialised")
 
-    def _drain(self, reason: str, drain_s: float = _DRAIN_S, stopped: str = "") -> None:
-        """Let packets under way arrive, and then end.
+    def _drain(
+        self, reason: str, drain_s: float = _DRAIN_S, stopped: str = "", is_asked: bool = False
+    ) -> None:
+        """Drain: wait until packets under way have arrived, then end.
 
-        ``stopped`` is the node that asks for it, and starts no further hook.
+        Args:
+            stopped: the node that asks for it, and starts no further hook.
+            is_asked: whether it is a node, or the duration of a run in virtual time.
         """
         self.phase = Phase.DRAINING
         now_s = time.monotonic()
@@ -495,11 +491,11 @@ class Supervisor:
         self._deadline_s = now_s + drain_s
         self._log("INFO", f"{reason}; letting packets under way arrive")
         self._peers.drain(reason, drain_s)
-        self._channels.send(control.Drain(self._declarations.last_round(stopped)))
+        self._channels.send(control.Drain(self._declarations.last_round(stopped), is_asked))
         self._probing.drain(self._processes.killed, now_s)
 
     def _tick_draining(self, now_s: float) -> None:
-        if self._probing.look(now_s, 0.0) is Verdict.DRAINED:
+        if self._probing.check(now_s, 0.0) is Verdict.DRAINED:
             if self._stops_hooks_first:
                 self._stops_hooks_first = False
                 self._channels.send(control.StopHooks())

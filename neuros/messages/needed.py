@@ -118,10 +118,10 @@ class Messages:
 
         return undeclared(missing)
 
-    def note_use(self) -> None:
+    def record_use(self) -> None:
         """Keep the builds from being removed as unused."""
         for built in self.built:
-            built.note_use()
+            built.record_use()
 
     def make(self, progress: Progress, environment: Mapping[str, str]) -> None:
         """Build what is missing.
@@ -256,13 +256,8 @@ class _Builder:
         """
         built = self.build.built
         try:
-            with built.locked(wait=False) as is_mine:
-                if is_mine:
-                    self._make()
-                    return
-            self.progress.step(f"waiting for another program that builds {self._name}")
-            with built.locked():
-                self._make()
+            text = f"waiting for another program that builds {self._name}"
+            built.build(self._make, lambda: self.progress.step(text))
         except OSError as error:
             raise EnvironmentFault(
                 f"message package '{self._name}' cannot be built in {built.folder.parent}"

@@ -244,7 +244,7 @@ class Built(Kept):
     def is_there(self) -> bool:
         return self.folder.is_dir()
 
-    def note_use(self) -> None:
+    def record_use(self) -> None:
         """Keep the build from being removed as unused."""
         with contextlib.suppress(OSError):
             os.utime(self.folder)

@@ -179,9 +179,9 @@ class NodeProcess:
                 for node in nodes:
                     node.pause()  # takes back what is left of steps, which might go on for ever
                 self._when_idle(lambda: self._reset(message))
-            case control.Drain(last_round):
+            case control.Drain(last_round, is_asked):
                 for node in nodes:
-                    node.drain(last_round.get(node.name, ()))
+                    node.drain(last_round.get(node.name, ()), is_asked=is_asked)
             case control.Pause():
                 for node in nodes:
                     node.pause()
@@ -194,6 +194,10 @@ class NodeProcess:
                     node.step(count, is_driven=is_driven)
             case control.Deliver(name, input_name, data) if name in self._nodes:
                 self._nodes[name].deliver(input_name, data)
+            case control.Change(name) if name in self._nodes:
+                self._nodes[name].change(
+                    message.variables, message.parameters, only_checks=message.only_checks
+                )
 
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""
@@ -265,7 +269,7 @@ class NodeProcess:
             action()
 
     def _answer_at_rest(self) -> None:
-        """Answer the last ``advance``; where the run goes on meanwhile, none is answered."""
+        """Answer the last ``advance``, unless the run was resumed meanwhile."""
         asked, self._asked = self._asked, None
         if asked is not None and not self.is_ending:
             self._tell(_at_rest(self._nodes, asked))
@@ -441,8 +445,8 @@ class ControlThread(threading.Thread):
         self._ended = threading.Event()
         # Here: once the thread comes to it, a node that fails at once may have closed them.
         self._selector = selectors.DefaultSelector()
-        self._selector.register(link, selectors.EVENT_READ, self._on_messages)
-        self._selector.register(signalled, selectors.EVENT_READ, self._on_signal)
+        self._selector.register(link, selectors.EVENT_READ)
+        self._selector.register(signalled, selectors.EVENT_READ)
 
     def run(self) -> None:
         """Until the supervisor hangs up or :meth:`end`."""
@@ -451,7 +455,12 @@ class ControlThread(threading.Thread):
             while not self._ended.is_set():
                 ready = selector.select(max(0.0, next_report_s - time.monotonic()))
                 for key, _ in ready:
-                    if not key.data():
+                    if key.fileobj is self._signalled:
+                        with contextlib.suppress(OSError):
+                            self._signalled.recv(64)
+                            if not self._ended.is_set():
+                                self._process.ask_to_stop()
+                    elif not self._handle_messages():
                         return
                 if time.monotonic() >= next_report_s and not self._ended.is_set():
                     next_report_s = time.monotonic() + _REPORT_S
@@ -463,14 +472,7 @@ class ControlThread(threading.Thread):
         waker.send(b"\0")
         self.join(_REPORT_S)
 
-    def _on_signal(self) -> bool:
-        with contextlib.suppress(OSError):
-            self._signalled.recv(64)
-            if not self._ended.is_set():
-                self._process.ask_to_stop()
-        return True
-
-    def _on_messages(self) -> bool:
+    def _handle_messages(self) -> bool:
         """Returns False once the supervisor is gone."""
         try:
             messages = self._link.receive()

@@ -138,7 +138,7 @@ class NodeReports:
         )
 
     def probe(self, number: int, *, is_idle: bool, has_free_threads: bool) -> Probed:
-        """The report with what only a moment between two events can tell. Loop thread only.
+        """A report between two events, with what can be known only then. Loop thread only.
 
         A thread of a plugin may submit packets, or end the project, at any time.
         """

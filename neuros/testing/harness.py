@@ -91,7 +91,7 @@ class Neighbours:
         if position > started:
             self._started[connection] = position
             if connection.is_reliable:
-                node = self._hub.inboxes[connection.source_node]
+                node = self._hub.ends[connection.source_node].inbox
                 self._hub.loop.post(partial(node.on_acknowledgement, connection, position))
 
     # ------------------------------------------------------------------ inbox
@@ -117,7 +117,7 @@ class Neighbours:
         window, waiting = self._windows[connection], self._waiting[connection]
         while waiting and not window.is_blocked:
             window.spend(0)
-            node = self._hub.inboxes[connection.destination_node]
+            node = self._hub.ends[connection.destination_node].inbox
             self._hub.loop.post(partial(node.on_packet, connection, waiting.popleft()))
 
 

@@ -131,7 +131,8 @@ class RosLoop:
         if self._has_posted_turn:
             self._is_turn_stale = True
         else:
-            self._post_turn()
+            self._has_posted_turn = True
+            self._executor.create_task(self._turn)
 
     def add_ros_timer(self, timer: Timer) -> None:
         """Call back a timer of a plugin after the hook during which it becomes due.

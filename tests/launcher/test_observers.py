@@ -83,10 +83,10 @@ def test_an_observer_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
     lines = run.join()
     lines.send(Watch())
     run.hear()
-    run.observers.look_at(Phase.RUNNING)
-    run.observers.look_at(Phase.RUNNING)
-    run.observers.look_at(Phase.DRAINING)
-    run.observers.part(Outcome(3, "why"))
+    run.observers.update(Phase.RUNNING)
+    run.observers.update(Phase.RUNNING)
+    run.observers.update(Phase.DRAINING)
+    run.observers.end(Outcome(3, "why"))
     assert told(lines, 3) == [
         PhaseChanged("running", False),
         PhaseChanged("draining", False),
@@ -106,7 +106,7 @@ def test_what_nodes_show_goes_to_the_observer_that_asked(run: Run) -> None:
         observer.send(GetStatus({"b": {}}))
         observer.send(GetStatus(wanted))  # takes the place of what was not asked yet
         run.hear(2)
-    run.observers.look_at(Phase.RUNNING)
+    run.observers.update(Phase.RUNNING)
     looks = told(node, 2)
     assert looks == [GetStatus({"a": {"x": {}}}, 1), GetStatus({}, 2)]
     for look in looks:
@@ -157,19 +157,19 @@ def test_a_run_goes_on_when_nobody_is_left_to_resume_it(run: Run) -> None:
     observer.send(Watch())
     observer.send(Pause())
     run.hear(2)
-    run.observers.look_at(Phase.RUNNING)
+    run.observers.update(Phase.RUNNING)
     assert run.pause.is_on
     observer.close()
     while run.pause.is_on:
         run.channels.wait(5.0)
         assert list(run.channels.receive()) == []
-        run.observers.look_at(Phase.RUNNING)
+        run.observers.update(Phase.RUNNING)
 
 
 def test_the_end_of_a_run_ends_a_pause(run: Run) -> None:
     run.pause.begin()
     run.now_s += 2.0
-    run.observers.look_at(Phase.DRAINING)
+    run.observers.update(Phase.DRAINING)
     run.now_s += 2.0
     assert (run.pause.is_on, run.pause.total_s) == (False, 2.0)
 

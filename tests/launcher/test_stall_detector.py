@@ -130,7 +130,7 @@ def test_a_packet_that_arrives_is_a_movement() -> None:
 
 def test_while_the_launcher_itself_stood_still_nobody_rested_or_was_silent() -> None:
     detector = detector_of("a")
-    detector.excuse(10.0)
+    detector.shift(10.0)
     assert not detector.has_just_stalled(14.9)
     assert remarks(detector, 14.9) == []
     assert detector.has_just_stalled(15.0)

@@ -387,7 +387,7 @@ class TestCache:
 
     def test_using_it_keeps_it(self, bench: Bench) -> None:
         old = self.entry(bench, "a_msgs", MONTH_S)
-        old.note_use()
+        old.record_use()
 
         sweep(old.folder.parent)
 

@@ -312,7 +312,7 @@ class World:
 
     def _probe(self) -> None:
         self.now_s += 1e3  # long after the last one
-        self.probing.look(self.now_s, 0.0)
+        self.probing.check(self.now_s, 0.0)
 
     # the launcher
 

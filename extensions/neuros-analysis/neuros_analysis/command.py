@@ -94,7 +94,7 @@ def _report(options: argparse.Namespace) -> int:
         print(f"missing: panels: {fault}")
     pages = {} if panels is None else {"panels.html": panels.encode()}
     whole = {**files, _PAGE: text.encode(), **worlds, **pages}
-    with _writing(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, data in whole.items():
             write_whole(folder / name, data)
@@ -158,7 +158,7 @@ def _compare(options: argparse.Namespace) -> int:
                 print(f"missing in {label}: {line}")
     if options.output is not None:
         page = _comparison_page(runs, header, rows)
-        with _writing(options.output.parent):
+        with writing(options.output.parent):
             options.output.parent.mkdir(parents=True, exist_ok=True)
             options.output.write_bytes(page)
         if not is_json:
@@ -172,7 +172,7 @@ def _comparison_page(runs: list[ReviewedRun], header: list[str], rows: list[list
     from neuros_analysis.charts import comparison_figure
     from neuros_analysis.comparison import labels_of
     from neuros_analysis.findings import findings_of
-    from neuros_analysis.run_pages import bottleneck_part, figure_part, page, png, table_part
+    from neuros_analysis.run_pages import bottleneck_part, figure_part, page, picture, table_part
 
     parts = [
         bottleneck_part(findings_of(run), f"The bottleneck of {label}")
@@ -180,13 +180,14 @@ def _comparison_page(runs: list[ReviewedRun], header: list[str], rows: list[list
     ]
     figure = comparison_figure(runs)
     if figure is not None:
-        parts.append(figure_part("Side by side", "", png(figure)))
+        parts.append(figure_part("Side by side", "", picture(figure)))
     parts.append(table_part("All figures", header, rows))
     return page("Comparison of runs", parts).encode()
 
 
 @contextlib.contextmanager
-def _writing(folder: Path) -> Iterator[None]:
+def writing(folder: Path) -> Iterator[None]:
+    """Turn what fails inside into a sentence. Raises ``EnvironmentFault``."""
     try:
         yield
     except OSError as error:

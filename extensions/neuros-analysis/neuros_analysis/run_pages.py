@@ -49,10 +49,10 @@ _PANELS_SCRIPTS = ("format.js", "plane.js", "spikes.js", "raster.js", "activity.
 _IMPORT = re.compile(r"^import .*$", re.MULTILINE)
 
 
-def png(figure: Any) -> bytes:
+def picture(figure: Any, kind: str = "png") -> bytes:
     """A figure as a file's content."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format=kind)
     return buffer.getvalue()
 
 
@@ -241,7 +241,7 @@ def figures_of(run: ReviewedRun) -> dict[str, tuple[str, str, bytes]]:
     for name, title, text, draw in _FIGURES:
         figure = draw(run)
         if figure is not None:
-            found[name] = (title, text, png(figure))
+            found[name] = (title, text, picture(figure))
     return found
 
 
