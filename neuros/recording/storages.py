@@ -235,9 +235,7 @@ class McapFile:
                 names[channel.id],
                 schema.name if schema else _UNKNOWN,
                 channel.message_encoding or _UNKNOWN,
-                _definition(schema.encoding, schema.data.decode(errors="replace"))
-                if schema
-                else _NO_DEFINITION,
+                definition,
                 counts.get(channel.id, 0),
                 channel.metadata.get("offered_qos_profiles", ""),
             )
