@@ -238,6 +238,7 @@ class Execution:
             "namespace": self._plan.project.names.namespace,
             "started": started,
             "options": recorded_values(self._plan.request),
+            **self._plan.provenance,
             **observed,
         }
         # Nodes of other machines are in percent of a core there.

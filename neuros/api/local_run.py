@@ -20,6 +20,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar
 
+from neuros.api.changes import Changes
 from neuros.api.live import why_it_ended
 from neuros.api.plan import Plan
 from neuros.api.run import Run
@@ -207,6 +208,15 @@ class LocalRun:
     def size_of(self, content: Any) -> int:
         """The bytes of a packet when it is serialised."""
         return len(self._middleware.packets.encode(content))
+
+    def change(self, changes: Changes, *, only_checks: bool = False) -> AtRest | None:
+        """Change environments and parameters; see :meth:`HeldRun.change`."""
+        if self._run is not None:
+            return None
+        with self._thread.until():
+            for name, (variables, parameters) in changes.items():
+                self._nodes[name].change(variables, parameters, only_checks=only_checks)
+        return self._rest({})
 
     def look(self) -> Sequence[NodeStatus] | None:
         """State and counters of each node."""
@@ -489,6 +499,7 @@ class LocalRun:
             "namespace": plan.project.names.namespace,
             "started": self._started,
             "options": recorded_values(plan.request),
+            **plan.provenance,
             "run_id": self._run_id,
             **provenance(sys.argv, plan.project.nodes, self.folder),
             "git": self._git.finish(),

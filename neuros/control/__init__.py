@@ -289,9 +289,15 @@ class Probe(Message):
 
 
 class Drain(Message):
-    """Stop the hooks that send unasked; ``last_round``: indices of hooks that start once more."""
+    """Stop the hooks that send unasked.
+
+    Attributes:
+        last_round: indices of hooks that start once more.
+        is_asked: whether a node has asked for the end, at a time of the run's clock.
+    """
 
     last_round: Mapping[str, tuple[int, ...]]
+    is_asked: bool = False
 
 
 class Begin(Message):
@@ -370,6 +376,21 @@ class Reset(Message):
 
     variables: Mapping[str, Mapping[str, str]]
     keep: Mapping[str, tuple[str, ...]] = {}
+
+
+class Change(Message):
+    """While paused, change what a node was given, and go on from there.
+
+    Attributes:
+        variables: of its environment.
+        parameters: of its ROS node.
+        only_checks: whether to check that this is possible, and to change nothing.
+    """
+
+    node: str
+    variables: Mapping[str, str]
+    parameters: Mapping[str, Any]
+    only_checks: bool = False
 
 
 class Deliver(Message):
@@ -451,10 +472,11 @@ TO_NODES: Sequence[type[Message]] = (
         Step,
         GetStatus,
     ),
-    *(Advance, Deliver, Reset),
+    *(Advance, Deliver, Reset, Change),
 )
 FROM_OBSERVERS: Sequence[type[Message]] = (
     *(Watch, GetStatus, Pause, Resume, Step, End, Interrupt, Advance, Deliver, Reset),
+    Change,
 )
 TO_OBSERVERS: Sequence[type[Message]] = (
     *(NodeStatus, PhaseChanged, LogRecord, Ended, AtRest, WasReset),

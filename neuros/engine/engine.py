@@ -19,7 +19,7 @@ from neuros.engine.hook import Hook, Source
 from neuros.engine.input_queue import Subscription
 from neuros.engine.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, State
 from neuros.engine.node_ports import Links, NodePorts, PacketType
-from neuros.engine.schedule import ExecutionLog, Lifecycle, Pause, Schedule
+from neuros.engine.schedule import FIRST_TURN, ExecutionLog, Lifecycle, Pause, Schedule
 from neuros.engine.send_window import SendWindow
 from neuros.engine.sim_clock import ClockSubscription
 from neuros.errors import HookError
@@ -252,6 +252,13 @@ class Engine:
         self._pause.grant(count, self._arrivals, is_driven=is_driven)
         self._pass()
 
+    def reading(self, value: int) -> int:
+        """What a hook reads of something that goes on by itself, such as a clock."""
+        return value
+
+    def note_callback(self) -> None:
+        """A callback of a ROS entity that the plugin has made runs."""
+
     def stop_hooks(self) -> None:
         """Start no further hook; the packets of the running one are still sent. Any thread."""
         self._lifecycle.is_stopped = True
@@ -367,19 +374,33 @@ class Engine:
         return now_ns
 
     def _pass(self) -> None:
+        """Run each candidate that is ready at its turn, by the turns at the begin of the pass.
+
+        Hooks that run meanwhile add and remove candidates. A new candidate belongs to the pass if
+        its turn is still to come, and was given before the pass began: up to ``last`` to executed
+        hooks, below ``new`` to the others.
+        """
         if self._is_passing:  # hooks never nest, even if one spins: the loop-back continues
             return
-        lifecycle, pause = self._lifecycle, self._pause
+        lifecycle, pause, candidates = self._lifecycle, self._pause, self._schedule.candidates
         if not lifecycle.has_begun:
             return
         if pause.is_on and self._ticks:
             pause.wake_ticks()
-        if self._schedule.candidates:
+        if candidates:
             self._is_passing = True
+            place, last, new = FIRST_TURN - 1, self._schedule.last_turn, self._schedule.new_turn
             try:
-                for hook in self._schedule.one_pass():
-                    if lifecycle.is_stopped:
+                while candidates:
+                    hook: Hook | None = None
+                    for each in candidates:
+                        turn = each.turn
+                        is_in_pass = place < turn <= last and (turn > 0 or turn < new)
+                        if is_in_pass and (hook is None or turn < hook.turn):
+                            hook = each
+                    if hook is None or lifecycle.is_stopped:
                         break
+                    place = hook.turn
                     if pause.is_on and not pause.allows(hook):
                         continue
                     if not hook.blocked or hook.can_send():
@@ -391,7 +412,7 @@ class Engine:
         if lifecycle.is_stopped:
             self._cause = self.rest()
         elif pause.is_on:
-            self._cause = pause.cause_of_rest(self._schedule.candidates, self.since_ns)
+            self._cause = pause.cause_of_rest(candidates, self.since_ns)
         else:
             self._cause = self._schedule.cause_of_rest()
         if not lifecycle.is_active and self._cause is not SCHEDULING and not self._to_itself:

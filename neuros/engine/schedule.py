@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from array import array
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from neuros.engine.hook import Hook, Source
 from neuros.engine.metrics import IDLE, PAUSED, SCHEDULING, Rest
@@ -23,8 +23,8 @@ from neuros.engine.send_window import SendWindow
 from neuros.hooks import HookKind
 from neuros.project.model import Connection
 
-_MANY = 2**62
-"""More hooks and executions than there will be."""
+FIRST_TURN = -(2**62)
+"""There will be fewer hooks and executions."""
 
 _LAST_STILL = 16
 
@@ -38,19 +38,21 @@ class Schedule:
     Attributes:
         order: all hooks, least recently executed first.
         candidates: the hooks that may run now, unless an output is blocked.
+        last_turn: the last one that was given to a hook that has started.
+        new_turn: the next one that a hook is given before its first start.
     """
 
     def __init__(self) -> None:
         self.order: dict[Hook, None] = {}
         self.candidates: set[Hook] = set()
-        self._turn = 0
-        self._first_turn = -_MANY
+        self.last_turn = 0
+        self.new_turn = FIRST_TURN
 
     def add(self, hook: Hook) -> None:
         """Insert a new hook before all executed hooks, and behind the others."""
         hook.candidates = self.candidates
-        hook.turn = self._first_turn
-        self._first_turn += 1
+        hook.turn = self.new_turn
+        self.new_turn += 1
         self.order = dict.fromkeys(sorted([*self.order, hook], key=_turn))
 
     def remove(self, hook: Hook) -> None:
@@ -61,28 +63,8 @@ class Schedule:
         """Give a hook that starts now the last place."""
         del self.order[hook]
         self.order[hook] = None
-        self._turn += 1
-        hook.turn = self._turn
-
-    def one_pass(self) -> Iterator[Hook]:
-        """The candidates in the order of their turns at the beginning of the pass.
-
-        Hooks that run meanwhile add and remove candidates. A new candidate belongs to the pass if
-        its turn is still to come, and was given before the pass began: up to ``last`` to executed
-        hooks, below ``first_new`` to the others.
-        """
-        last, first_new, place = self._turn, self._first_turn, -_MANY - 1
-        while self.candidates:
-            found: Hook | None = None
-            for hook in self.candidates:
-                turn = hook.turn
-                is_in_pass = place < turn <= last and (turn > 0 or turn < first_new)
-                if is_in_pass and (found is None or turn < found.turn):
-                    found = hook
-            if found is None:
-                return
-            place = found.turn
-            yield found
+        self.last_turn += 1
+        hook.turn = self.last_turn
 
     # ------------------------------------------------------------------ questions
 

@@ -295,6 +295,8 @@ class Observers:
                     whither = f"'{node}.{input_name}'"
                     raise ControlError(f"a packet came for {whither}, no session's input")
                 self._channels.send_to_node(node, message)
+            case control.Change(node):
+                self._channels.send_to_node(node, message)
             case control.Step(count):
                 self._pause.step(count, is_driven=self._is_driven())
             case control.End(reason):

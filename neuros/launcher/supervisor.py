@@ -294,7 +294,7 @@ class Supervisor:
             case control.Shutdown(node, reason, drain_s):
                 because = f": {reason}" if reason else ""
                 why = f"{node} ended the project{because}" if node else reason
-                self._handle(RunEvent.END, why, drain_s, node)
+                self._handle(RunEvent.END, why, drain_s, node, True)
             case control.Failed(node, text):
                 # Of a run that ends well, the failure of a node that was killed does not matter.
                 if self.outcome.failures or node not in self._processes.killed:
@@ -475,10 +475,14 @@ class Supervisor:
             self._end_asked = reason, *details
             self._log("INFO", f"{reason}; the end comes once every node has initialised")
 
-    def _drain(self, reason: str, drain_s: float = _DRAIN_S, stopped: str = "") -> None:
+    def _drain(
+        self, reason: str, drain_s: float = _DRAIN_S, stopped: str = "", is_asked: bool = False
+    ) -> None:
         """Drain: wait until packets under way have arrived, then end.
 
-        ``stopped`` is the node that asks for it, and starts no further hook.
+        Args:
+            stopped: the node that asks for it, and starts no further hook.
+            is_asked: whether it is a node, or the duration of a run in virtual time.
         """
         self.phase = Phase.DRAINING
         now_s = time.monotonic()
@@ -487,7 +491,7 @@ class Supervisor:
         self._deadline_s = now_s + drain_s
         self._log("INFO", f"{reason}; letting packets under way arrive")
         self._peers.drain(reason, drain_s)
-        self._channels.send(control.Drain(self._declarations.last_round(stopped)))
+        self._channels.send(control.Drain(self._declarations.last_round(stopped), is_asked))
         self._probing.drain(self._processes.killed, now_s)
 
     def _tick_draining(self, now_s: float) -> None:

@@ -96,15 +96,27 @@ class Messages:
         """Whether everything is built."""
         return all(built.is_there for built in self.built)
 
+    @property
+    def _missing(self) -> list[Package]:
+        return [build.package for build in self._builds if not build.built.is_there]
+
     def problems(self) -> list[Problem]:
         """Mistakes in the files of packages; a built package had none."""
-        missing = [build.package for build in self._builds if not build.built.is_there]
+        missing = self._missing
         if not missing:
             return self._problems
         # Imported here: most of the time everything is built.
         from neuros.messages.checking import check
 
         return [*self._problems, *check(missing, self._workspaces)]
+
+    def doubts(self) -> list[Problem]:
+        """What ROS may refuse in packages that are not built yet."""
+        if not (missing := self._missing):
+            return []
+        from neuros.messages.checking import undeclared
+
+        return undeclared(missing)
 
     def record_use(self) -> None:
         """Keep the builds from being removed as unused."""
@@ -294,7 +306,9 @@ class _Builder:
             shares,
         )
         # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.
-        self._run([sys.executable, "-I", generation.__file__], order.text())
+        # Generators open some files in the encoding of the locale, which may not be UTF-8.
+        command = [sys.executable, "-I", "-X", "utf8", generation.__file__]
+        self._run(command, order.text())
 
     def _compile(self) -> None:
         """Make the libraries of the package, and its module for Python."""
@@ -402,7 +416,7 @@ class _Builder:
             env=self.environment,
             input=given,
             capture_output=True,
-            text=True,
+            encoding="utf-8",
             errors="replace",
             check=False,
         )

@@ -17,10 +17,10 @@ from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
-from neuros.errors import ControlError, HookError, NeurosError, ProtocolError
+from neuros.errors import ControlError, HookError, NeurosError, NodeError, ProtocolError
 from neuros.hooks import HookKind, HookSpec, hook_specs_of
 from neuros.node.context import Context, ContextSwitch
-from neuros.node.failures import Failures
+from neuros.node.failures import Failures, as_node_error
 from neuros.node.handle import NodeHandle, PluginServices, Results
 from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Passage
 from neuros.node.keeping import Keeping
@@ -30,7 +30,15 @@ from neuros.node.reports import NodeReports
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
 from neuros.node.virtual import Durations, VirtualTime
-from neuros.ports import Middleware, NodeEvents, NodeLoop, PacketRecorder, Transport, Way
+from neuros.ports import (
+    Advance,
+    Middleware,
+    NodeEvents,
+    NodeLoop,
+    PacketRecorder,
+    Transport,
+    Way,
+)
 from neuros.project.model import Connection, NodeFile, Port
 from neuros.project.timing import VIRTUAL
 
@@ -55,6 +63,7 @@ class NodeRuntime:
         is_held: whether hooks stand still from the start, as paused, and the newest packets of each
             output are kept.
         is_local: whether the session that holds it is in the same thread.
+        drive: see :meth:`NodeHandle.drive`.
 
     Attributes:
         histories: the newest packets, where they are kept.
@@ -81,6 +90,7 @@ class NodeRuntime:
         make_engine: Callable[..., Engine] = Engine,
         is_held: bool = False,
         is_local: bool = False,
+        drive: Callable[[Advance], bool] = lambda _: False,
     ) -> None:
         self.file = file
         self.name = file.node.name
@@ -124,6 +134,7 @@ class NodeRuntime:
             self._ask_for_end,
             lambda text: tell(Progress(self.name, text)),
             lambda look: self.reports.show_world(look),
+            drive,
             Results(self.run_dir),
             self.keeping,
         )
@@ -211,7 +222,9 @@ class NodeRuntime:
         """
         self._enter()
         self._transport.open(self)
-        self._middleware.mark_own_entities(self.file, self._enter, self.failures.report_callback)
+        self._middleware.mark_own_entities(
+            self.file, self._enter_callback, self.failures.report_callback
+        )
         self._load_plugin()
         self.reports.open(self._make(), self._logger)
 
@@ -229,6 +242,12 @@ class NodeRuntime:
 
     def activate(self) -> None:
         """Every node of the project is ready: tick and function hooks may start from now on."""
+        if self._virtual is None:
+            self._activate()
+        else:
+            self._virtual.at_zero(self._activate, self.on_timer)
+
+    def _activate(self) -> None:
         if self._services.virtual_time is not None:
             self._services.virtual_time.activate()
         self._guard(self._loaded.activate)
@@ -290,16 +309,49 @@ class NodeRuntime:
         for connection in engine.send_windows:
             engine.on_registered(connection)
 
-    def drain(self, last_round: Sequence[int] = ()) -> None:
+    def change(
+        self,
+        variables: Mapping[str, str],
+        parameters: Mapping[str, Any],
+        *,
+        only_checks: bool = False,
+    ) -> None:
+        """Change the environment and the parameters, between two hooks; a fault ends the node.
+
+        Args:
+            only_checks: whether to check that this is possible, and to change nothing.
+        """
+        self._enter()
+        try:
+            if only_checks:
+                for _, check in self._services.changes:
+                    check(variables)
+                return
+            self._contexts.change(self._context, variables)
+            ros_node = self._middleware.ros_node(self.file)
+            for name, value in parameters.items():
+                kind = type(ros_node.get_parameter(name))
+                (result,) = ros_node.set_parameters([kind(name, value=value)])
+                if not result.successful:
+                    raise NodeError(f"parameter '{name}' cannot be {value!r}: {result.reason}")
+            for apply, _ in self._services.changes:
+                apply()
+        except BaseException as error:
+            known = isinstance(error, NeurosError)
+            self.failures.report(error if known else as_node_error(error, "a fork changes it: "))
+
+    def drain(self, last_round: Sequence[int] = (), *, is_asked: bool = False) -> None:
         """Stop the hooks that send unasked; after a pause, the others go on.
 
-        Those of ``last_round`` (see :meth:`Engine.drain`) start at most once more.
+        Args:
+            last_round: hooks that start at most once more; see :meth:`Engine.drain`.
+            is_asked: whether a node has asked for this, at a time of the run's clock.
         """
         drain = partial(self._guard, lambda: self._loaded.drain(last_round))
         if self._virtual is None:
             drain()
         else:
-            self._virtual.drain(drain, self.stop)
+            self._virtual.drain(drain, self.stop, is_asked=is_asked)
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`."""
@@ -398,6 +450,11 @@ class NodeRuntime:
         own = {**self.file.node.environment, "NEUROS_RUN_DIR": str(self.run_dir)}
         return {**own, **variables}
 
+    def _enter_callback(self) -> None:
+        self._enter()
+        if self.engine is not None:
+            self.engine.note_callback()
+
     def _load_plugin(self) -> None:
         node = self.file.node
         for port in (*node.inputs, *node.outputs):  # the plugin may make messages when imported
@@ -438,6 +495,8 @@ class NodeRuntime:
 
     def _on_ready(self) -> None:
         self._restore()
+        if self._virtual is not None:
+            self._virtual.ready()
         self._tell(Ready(self.name))
 
     def _on_hook_initialised(self) -> None:

@@ -179,9 +179,9 @@ class NodeProcess:
                 for node in nodes:
                     node.pause()  # takes back what is left of steps, which might go on for ever
                 self._when_idle(lambda: self._reset(message))
-            case control.Drain(last_round):
+            case control.Drain(last_round, is_asked):
                 for node in nodes:
-                    node.drain(last_round.get(node.name, ()))
+                    node.drain(last_round.get(node.name, ()), is_asked=is_asked)
             case control.Pause():
                 for node in nodes:
                     node.pause()
@@ -194,6 +194,10 @@ class NodeProcess:
                     node.step(count, is_driven=is_driven)
             case control.Deliver(name, input_name, data) if name in self._nodes:
                 self._nodes[name].deliver(input_name, data)
+            case control.Change(name) if name in self._nodes:
+                self._nodes[name].change(
+                    message.variables, message.parameters, only_checks=message.only_checks
+                )
 
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""

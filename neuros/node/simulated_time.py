@@ -65,13 +65,13 @@ class SimulatedTime:
             return self._read_s()
         return None if self.clock.now_ns is None else self.clock.now_ns / 1e9
 
-    def stamp(self) -> Any:
+    def stamp(self, reading: Callable[[int], int]) -> Any:
         """A stamp of now: simulated where the node owns time or has a clock, else wall time."""
         if self._read_s is not None:
             return to_stamp(self._read_s())
         if self._has_clock or self.is_watched:
             return to_stamp(nanoseconds=self.clock.now_ns or 0)
-        return to_stamp(nanoseconds=self._wall_ns())
+        return to_stamp(nanoseconds=reading(self._wall_ns()))
 
     def begin_anew(self, *, keeps_owner: bool) -> None:
         """The node was reset; ``keeps_owner``: the simulator that has the time goes on."""

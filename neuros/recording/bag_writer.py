@@ -16,6 +16,7 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from neuros.distribution import __version__
@@ -95,15 +96,22 @@ class BagWriter:
         self._topics: list[dict[str, Any]] = []
         self._first_ns, self._last_ns = _LAST_NS, 0
 
-    def add_topic(self, topic: Topic) -> int:
+    def add_topic(self, topic: Topic, types: Typestore | None = None) -> int:
         """The number of a new topic, for :meth:`put`.
+
+        Args:
+            types: has the definition of its type, which is that of the first topic of the type;
+                ``None``: the installed one.
 
         Raises:
             EnvironmentFault: if the definition of its type is not installed.
         """
-        define(topic.type, self._types)
+        if types is None:
+            types = self._types
+            define(topic.type, types)
+        name = normalize_msgtype(topic.type)  # differs for a service event
         if topic.type not in self._schemas:
-            definition, _ = self._types.generate_msgdef(topic.type, ros_version=2)
+            definition, _ = types.generate_msgdef(name, ros_version=2)
             schema = self._mcap.register_schema(topic.type, "ros2msg", definition.encode())
             self._schemas[topic.type] = schema
         qos = [
@@ -129,7 +137,7 @@ class BagWriter:
                 "type": topic.type,
                 "serialization_format": "cdr",
                 "offered_qos_profiles": qos,
-                "type_description_hash": self._types.hash_rihs01(topic.type),
+                "type_description_hash": types.hash_rihs01(name),
             }
         )
         return number

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ import neuros.launcher.quiescence as quiescence
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.input_queue import InputQueue, Subscription
-from neuros.engine.schedule import Lifecycle, Schedule
+from neuros.engine.schedule import FIRST_TURN, Lifecycle, Schedule
 from neuros.engine.send_window import SendWindow
 from neuros.project.model import Connection
 
@@ -64,8 +64,10 @@ def _holds_one(subscription: Subscription, *arguments: Any, **options: Any) -> N
     subscription.capacity = 1
 
 
-def _last_executed(schedule: Schedule) -> Iterator[Hook]:
-    yield max(schedule.candidates, key=lambda hook: hook.turn)
+def _stay_first(schedule: Schedule, hook: Hook) -> None:
+    for other in schedule.order:
+        other.turn = schedule.last_turn + 1  # behind each pass
+    hook.turn = FIRST_TURN
 
 
 MUTANTS: Sequence[Mutant] = (
@@ -114,7 +116,7 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "the hook that was least recently executed comes first",
         "two hooks of which one never rests",
-        lambda: patch.object(Schedule, "one_pass", _last_executed),
+        lambda: patch.object(Schedule, "move_to_end", _stay_first),
     ),
     Mutant(
         "hooks that send unasked stop when the end is drained",

@@ -340,6 +340,7 @@ class TestClock:
                 [0, 3 * second_ns, 4 * second_ns],
             ),
             "credits": ([0, 5, 1005 * second_ns], [0, 5, 5 * second_ns]),
+            "pauses": ([1006 * second_ns, 1007 * second_ns], [6 * second_ns, 7 * second_ns]),
         }
         for name, (there, _) in files.items():
             (tmp_path / name).write_bytes(array("q", there).tobytes())
