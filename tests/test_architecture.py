@@ -46,6 +46,7 @@ PACKAGES = (
     Package(1, ("installation",)),
     Package(0, ("ordinary_files",)),
     Package(1, ("caching",)),
+    Package(1, ("arithmetic",)),
     Package(2, ("engine",)),
     Package(3, ("ports", "control", "stacks", "options", "registry")),
     Package(4, ("transport",)),

@@ -27,6 +27,7 @@ from neuros.api.run import Run
 from neuros.api.run_folder import make_run_folder, removed_folders, save_record, write_node_files
 from neuros.api.run_record import EXIT_ENVIRONMENT, judge, run_record, run_table
 from neuros.backends.console import format_record
+from neuros.backends.portable import check_this_process
 from neuros.control import AtRest, Message, NodeStatus, Ready, Shutdown
 from neuros.errors import NeurosError, RunError, UsageError
 from neuros.launcher.outcome import EXIT_CODES, Outcome
@@ -68,13 +69,16 @@ class LocalRun:
         exposes: whether ROS tools see its topics.
 
     Raises:
-        UsageError: if the run folder cannot be made.
+        UsageError: if the run folder cannot be made, or this Python was started without the
+            variables of a portable run.
     """
 
     _nest_user: ClassVar[LocalRun | None] = None
 
     def __init__(self, plan: Plan, messages: Sequence[Path], *, exposes: bool) -> None:
         request, project = plan.request, plan.project
+        if project.is_portable:
+            check_this_process(plan.nodes)
         sys.path[:0] = [path for path in map(str, messages) if path not in sys.path]
         self._plan = plan
         self._started = time.time()
@@ -495,6 +499,7 @@ class LocalRun:
         record |= {
             "backend": NAME,
             "is_one_process": True,
+            "is_portable": plan.project.is_portable,
             "domain_id": None,
             "namespace": plan.project.names.namespace,
             "started": self._started,

@@ -16,6 +16,7 @@ from typing import Any
 from neuros.api.kept import Sources, find_sources, given_sources
 from neuros.api.request import Duration, Request
 from neuros.backends.node_command import place, usable_cores, without_mark
+from neuros.backends.portable import portable_project
 from neuros.backends.process_launchers import VIRTUAL_ROS, WITHOUT_ROS
 from neuros.backends.pythons import Pythons, require_one_python
 from neuros.backends.reaper import Reaper
@@ -265,6 +266,10 @@ def make_plan(
     except UnicodeEncodeError:
         text = f"{project.folder}: the name is not UTF-8, as ROS needs it: rename it"
         raise UsageError(text) from None
+    if project.is_portable if request.portable is None else request.portable:
+        project = portable_project(project, os.environ)
+    else:
+        project = replace(project, is_portable=False)
     network = chosen_network(request.network, request.peers)
     known = [node.name for node in project.nodes]
     for name in request.nodes:

@@ -62,12 +62,15 @@ def _verify(options: argparse.Namespace) -> int:
                 "difference": verdict.difference,
                 "consumed_differently": verdict.consumed_differently,
                 "not_compared": verdict.not_compared,
+                "likely_cause": verdict.likely_cause,
                 "notes": remarks,
             }
         )
         return exit_code
     for remark in remarks:
         print(f"note: {remark}")
+    if verdict.likely_cause:
+        print(f"likely cause: {verdict.likely_cause}")
     print(f"{result}: {what}")
     return exit_code
 

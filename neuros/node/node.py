@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+from neuros.arithmetic import note_arithmetic
 from neuros.control import AtRest, Finalising, Message, Progress, Ready, Shutdown
 from neuros.control.link import to_bytes
 from neuros.engine.engine import Engine
@@ -387,6 +388,7 @@ class NodeRuntime:
             self._save_packets()
         if self._recorder is not None:
             self._recorder.close()
+        note_arithmetic(self.run_dir)
         self._services.close()
         self._tell(Finalising(self.name, None))
 

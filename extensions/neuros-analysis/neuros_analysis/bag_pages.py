@@ -13,7 +13,7 @@ from neuros.bag import Bag
 from neuros.recording.run_file import RUN_FILE
 from neuros.recording.stored import METADATA_NAME, bag_files
 from neuros_analysis.charts import colour, new_figure, plain
-from neuros_analysis.run_pages import figure_part, page, png, table_part
+from neuros_analysis.run_pages import figure_part, page, picture, table_part
 
 HEADER = ("topic", "type", "packets", "rate / Hz", "median / ms", "longest / ms", "bytes")
 _MOST_MARKS = 2000
@@ -84,7 +84,7 @@ def bag_page(bag: Bag, topics: list[TopicTimes]) -> str:
     drawn = [topic for topic in topics if len(topic.times_s)]
     if drawn:
         text = "A mark for each packet; where they are dense, for some of them."
-        parts.append(figure_part("Packets over time", text, png(times_figure(drawn))))
+        parts.append(figure_part("Packets over time", text, picture(times_figure(drawn))))
     return page(f"Bag {bag.folder.name}", parts)
 
 

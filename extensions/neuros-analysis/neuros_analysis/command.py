@@ -124,7 +124,7 @@ def _report_bag(options: argparse.Namespace) -> int:
     print(tabulate([topic.row for topic in topics], HEADER, disable_numparse=True))
     for note in notes:
         print(f"note: {note}")
-    with _writing(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, text in pages.items():
             write_whole(folder / name, text.encode())

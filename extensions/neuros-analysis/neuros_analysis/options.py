@@ -75,6 +75,7 @@ class SweepOptions:
     )
     backend: str | None = like(Request, "backend")
     duration: float | str | None = like(Request, "duration")
+    portable: bool | None = like(Request, "portable")
     record: bool | Sequence[str] = like(Request, "record", group="")
     output: str | os.PathLike[str] | None = option(
         "-o",
