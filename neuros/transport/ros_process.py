@@ -233,7 +233,7 @@ class PeerVoice:
         self._thread = threading.Thread(target=self._listen, name="neuros-peers", daemon=True)
         self._thread.start()
 
-    def say(self, text: str) -> None:
+    def publish(self, text: str) -> None:
         """Publish a state, also for launchers that come later. Any thread."""
         for publisher in self._publishers:
             publisher.publish(String(data=text))
