@@ -140,9 +140,9 @@ class RosProcess:
         names: Sequence[str],
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
-    ) -> PeerVoice:
+    ) -> PeerStatePublisher:
         namespace = self._files[0].names.namespace
-        return PeerVoice(names, elsewhere, self._context, heard, namespace)
+        return PeerStatePublisher(names, elsewhere, self._context, heard, namespace)
 
     def take_in(self) -> None:
         """Handle what had arrived when the loop ended, but for callbacks of plugins."""
@@ -179,7 +179,7 @@ class RosProcess:
 # ---------------------------------------------------------------------- peers
 
 
-class PeerVoice:
+class PeerStatePublisher:
     """Publishes the state of this launcher for its nodes, and receives that of nodes elsewhere.
 
     It has a thread of its own.
