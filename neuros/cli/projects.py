@@ -207,36 +207,34 @@ def add_new(new: argparse.ArgumentParser) -> None:
 
 
 def _new(options: argparse.Namespace) -> int:
-    if options.robot is not None:
-        return _new_robot(options.robot, options.folder, options.base, options.drive)
-    if options.folder is None:
-        raise UsageError("name a folder for the project, or a robot with --robot FILE")
-    if options.base or options.drive:
-        raise UsageError("--base and --drive belong to --robot FILE")
-    _copy(_TEMPLATE, options.folder, {})
-    print(f"made {options.folder}; the next command: neuros launch {options.folder}")
-    return 0
-
-
-def _new_robot(robot: Path, folder: Path | None, base: str | None, drive: str | None) -> int:
+    robot, folder = options.robot, options.folder
+    if robot is None:
+        if folder is None:
+            raise UsageError("name a folder for the project, or a robot with --robot FILE")
+        if options.base or options.drive:
+            raise UsageError("--base and --drive belong to --robot FILE")
+        _copy(_TEMPLATE, folder, {})
+        print(f"made {folder}; the next command: neuros launch {folder}")
+        return 0
     if not robot.is_file():
         raise UsageError(f"--robot {robot}: there is no such file")
-    made = folder or Path(robot.name.partition(".")[0])
-    _require_empty(made)
+    folder = folder or Path(robot.name.partition(".")[0])
+    _require_empty(folder)
     format_ = MODELS.load(robot.suffix.lower()[1:])
+    choices = RobotChoices(options.base, options.drive)
     # First into a folder beside: after an error there is none.
     try:
-        made.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".new-", dir=made.parent) as draft:
-            inside = Path(draft) / made.name
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".new-", dir=folder.parent) as draft:
+            inside = Path(draft) / folder.name
             inside.mkdir()
-            rows = format_.make_project(robot, inside, os.environ, RobotChoices(base, drive))
-            shutil.copytree(inside, made, dirs_exist_ok=True)
+            rows = format_.make_project(robot, inside, os.environ, choices)
+            shutil.copytree(inside, folder, dirs_exist_ok=True)
     except OSError as error:
         reason = error.strerror or error
-        raise UsageError(f"{made} cannot be made ({reason}): name another folder") from error
+        raise UsageError(f"{folder} cannot be made ({reason}): name another folder") from error
     print("\n".join(rows))
-    print(f"made {made}; the next command: neuros launch {made} --dashboard")
+    print(f"made {folder}; the next command: neuros launch {folder} --dashboard")
     return 0
 
 
