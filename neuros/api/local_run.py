@@ -20,12 +20,14 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar
 
+from neuros.api.changes import Changes
 from neuros.api.live import why_it_ended
 from neuros.api.plan import Plan
 from neuros.api.run import Run
 from neuros.api.run_folder import make_run_folder, removed_folders, save_record, write_node_files
 from neuros.api.run_record import EXIT_ENVIRONMENT, judge, run_record, run_table
 from neuros.backends.console import format_record
+from neuros.backends.portable import check_this_process
 from neuros.control import AtRest, Message, NodeStatus, Ready, Shutdown
 from neuros.errors import NeurosError, RunError, UsageError
 from neuros.launcher.outcome import EXIT_CODES, Outcome
@@ -67,13 +69,16 @@ class LocalRun:
         exposes: whether ROS tools see its topics.
 
     Raises:
-        UsageError: if the run folder cannot be made.
+        UsageError: if the run folder cannot be made, or this Python was started without the
+            variables of a portable run.
     """
 
     _nest_user: ClassVar[LocalRun | None] = None
 
     def __init__(self, plan: Plan, messages: Sequence[Path], *, exposes: bool) -> None:
         request, project = plan.request, plan.project
+        if project.is_portable:
+            check_this_process(plan.nodes)
         sys.path[:0] = [path for path in map(str, messages) if path not in sys.path]
         self._plan = plan
         self._started = time.time()
@@ -208,11 +213,20 @@ class LocalRun:
         """The bytes of a packet when it is serialised."""
         return len(self._middleware.packets.encode(content))
 
+    def change(self, changes: Changes, *, only_checks: bool = False) -> AtRest | None:
+        """Change environments and parameters; see :meth:`HeldRun.change`."""
+        if self._run is not None:
+            return None
+        with self._thread.until():
+            for name, (variables, parameters) in changes.items():
+                self._nodes[name].change(variables, parameters, only_checks=only_checks)
+        return self._rest({})
+
     def look(self) -> Sequence[NodeStatus] | None:
         """State and counters of each node."""
         if self._run is not None or (not self._is_behind and self.advance(0, {}) is None):
             return None
-        return [node.reports.look({}, 0) for node in self._nodes.values()]
+        return [node.reports.status({}, 0) for node in self._nodes.values()]
 
     def reset(
         self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
@@ -234,7 +248,7 @@ class LocalRun:
                 except NeurosError as error:
                     self._fail(node.name, error)
                     break
-                self._declarations.take(declared(node.name, node.specs))
+                self._declarations.add(declared(node.name, node.specs))
                 self._loop.post(partial(node.start, awaits_others=not self._is_active))
             self._come_to_rest()
         return True
@@ -318,7 +332,7 @@ class LocalRun:
             is_local=True,
         )
         node.load()
-        self._declarations.take(declared(node.name, node.specs))
+        self._declarations.add(declared(node.name, node.specs))
 
     def _activate(self) -> None:
         """Every node is ready: this is time 0 of the run."""
@@ -354,7 +368,7 @@ class LocalRun:
             self._next_report_s = now_s + _REPORT_S
             for node in self._nodes.values():
                 node.reports.write_logs()
-                self._outcome.take(node.reports.report(), now_s)
+                self._outcome.add(node.reports.report(), now_s)
         packets = {}
         for name, number in known.items():
             node_name, _, output = name.partition(".")
@@ -449,7 +463,7 @@ class LocalRun:
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
                     node.reports.write_logs()
-                    outcome.take(node.reports.report(is_final=True), time.monotonic())
+                    outcome.add(node.reports.report(is_final=True), time.monotonic())
         finally:
             self._middleware.close()
             self._contexts.close()
@@ -485,10 +499,12 @@ class LocalRun:
         record |= {
             "backend": NAME,
             "is_one_process": True,
+            "is_portable": plan.project.is_portable,
             "domain_id": None,
             "namespace": plan.project.names.namespace,
             "started": self._started,
             "options": recorded_values(plan.request),
+            **plan.provenance,
             "run_id": self._run_id,
             **provenance(sys.argv, plan.project.nodes, self.folder),
             "git": self._git.finish(),

@@ -16,6 +16,7 @@ from xxhash import xxh3_64_intdigest
 
 from neuros.api.packets import Numbers, PacketLists, read_packets
 from neuros.api.run_record import PastRun
+from neuros.arithmetic import differences
 from neuros.bag import Bag, RecordedTopic, open_bag
 from neuros.errors import NeurosError
 from neuros.recording.recording_plan import PLAN_NAME
@@ -110,6 +111,8 @@ class RunComparison:
         compared: packets that were found equal.
         consumed_differently: connections with equal packets, of which hooks consumed others.
         not_compared: connections of which not all packets could be compared.
+        likely_cause: for runs that differ, how processors and libraries of nodes did, in words;
+            empty if they did not.
     """
 
     difference: str | None
@@ -117,6 +120,7 @@ class RunComparison:
     compared: int
     consumed_differently: tuple[str, ...] = ()
     not_compared: tuple[str, ...] = ()
+    likely_cause: str = ""
 
 
 @dataclass(frozen=True)
@@ -138,7 +142,8 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> RunComparison:
 
     Where nodes have kept no digests, those of the bags of the runs are compared. Which packets
     hooks consume of a connection that may lose packets depends on timing: such a difference is
-    only a remark.
+    only a remark. In virtual time it is none, and neither is one between the times at which packets
+    were sent and hooks started.
     """
     comparer = _Comparer((a, b), recorded)
     for name in dict.fromkeys([*a.connections, *b.connections]):
@@ -148,8 +153,42 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> RunComparison:
             only = "A" if name in a.connections else "B"
             text = f"{name}: only run {only} has this connection"
             comparer.differences.append(_Difference(-1.0, text))
+    comparer.compare_hooks()
     comparer.compare_values()
     return comparer.result()
+
+
+def first_difference(
+    a: PastRun, b: PastRun, counts: Mapping[str, int], recorded: RecordedPackets
+) -> tuple[int, str]:
+    """Compare the first packets of connections: how many, and in which one the runs differ first.
+
+    Args:
+        counts: by connection, how many packets to compare.
+    """
+    compared, differences = 0, []
+    for name in (name for name in counts if name in a.connections and name in b.connections):
+        in_a, in_b = (
+            _between(each, 0, counts[name]) for each in packets_of_both(name, (a, b), recorded)
+        )
+        compared += _first_difference(in_a.sent, in_b.sent)
+        found = _sent(name, in_a, in_b)
+        if found is not None and not in_a.sent_before + in_b.sent_before:
+            differences.append(found)
+    if not differences:
+        return compared, ""
+    return compared, _told(min(differences, key=lambda each: each.at_ns), (a, b), recorded)
+
+
+def _told(first: _Difference, runs: tuple[PastRun, PastRun], recorded: RecordedPackets) -> str:
+    """A difference with the field in which it lies, if the runs were recorded."""
+    if first.packet is None:
+        return first.text
+    messages = [recorded.message(run.folder, *first.packet) for run in runs]
+    if None in messages:
+        return f"{first.text} (to see in which field, run both with --record)"
+    field = next(differing_fields(*messages), None)
+    return first.text + (f" in {field}" if field else " (but no recorded field does)")
 
 
 class _Comparer:
@@ -163,34 +202,33 @@ class _Comparer:
         self._consumed_differently: list[str] = []
         self._not_compared: list[str] = []
         self._compared = 0
+        self._is_virtual = all("virtual_s" in run.record for run in runs)
 
     def result(self) -> RunComparison:
-        text = None
+        text, cause = None, ""
         if self.differences:
             first = min(self.differences, key=lambda difference: difference.at_ns)
-            text = first.text
             others = len(self.differences) - 1
             if others:
                 differ = "connections differ" if others > 1 else "connection differs"
                 self._remarks.append(f"{others} more {differ}, from a later moment on")
-            if first.packet is not None:  # a bag is read for the first difference only
-                messages = [self._recorded.message(run.folder, *first.packet) for run in self._runs]
-                if None in messages:
-                    text += " (to see in which field, run both with --record)"
-                else:
-                    field = next(differing_fields(*messages), None)
-                    text += f" in {field}" if field else " (but no recorded field does)"
+            text = _told(first, self._runs, self._recorded)
+            records = [run.record for run in self._runs]
+            cause = differences(*(record.get("arithmetic") or {} for record in records))
+            if cause and not all(record.get("is_portable") for record in records):
+                cause += " (run both with --portable)"
         return RunComparison(
             text,
             tuple(self._remarks),
             self._compared,
             tuple(self._consumed_differently),
             tuple(self._not_compared),
+            cause,
         )
 
     def compare(self, name: str) -> None:
         """Compare the packets of a connection that both runs have."""
-        both = _packets(name, self._runs, self._recorded)
+        both = packets_of_both(name, self._runs, self._recorded)
         counts = [run.connections[name]["sent"] for run in self._runs]
         lacking = [
             str(run.folder)
@@ -230,13 +268,32 @@ class _Comparer:
             consumed = _consumed(name, in_a, in_b)
         consumed = consumed or self._counted(name)
         sent = _sent(name, in_a, in_b)
+        is_lossless = self._runs[0].connections[name]["discard_limit"] == 0
+        timed = _timed(name, in_a, in_b) if self._is_virtual else None
         if sent is not None:
             self.differences.append(sent)
-        elif consumed is not None and self._runs[0].connections[name]["discard_limit"] == 0:
+        elif consumed is not None and (is_lossless or self._is_virtual):
             self.differences.append(consumed)
+        elif timed is not None:
+            self.differences.append(timed)
         elif consumed is not None:
             self._consumed_differently.append(name)
             self._remarks.append(f"{consumed.text}: this connection may lose packets")
+
+    def compare_hooks(self) -> None:
+        """Compare how often hooks started in virtual time, and how long they took."""
+        a, b = (run.nodes for run in self._runs)
+        for node in [name for name in a if name in b] if self._is_virtual else ():
+            hooks = [nodes[node].get("hooks", {}) for nodes in (a, b)]
+            for hook in dict.fromkeys([*hooks[0], *hooks[1]]):
+                figures = [
+                    (each.get(hook, {}).get("executions", 0), each.get(hook, {}).get("busy_s", 0.0))
+                    for each in hooks
+                ]
+                if figures[0] != figures[1]:
+                    a_text, b_text = (f"{n} times, for {s:.9g} s" for n, s in figures)
+                    text = f"hook '{hook}' of {node} ran {a_text} in run A, and {b_text} in run B"
+                    self.differences.append(_Difference(np.inf, text))
 
     def compare_values(self) -> None:
         """Compare the files of what plugins keep, and of what was restored to them."""
@@ -257,7 +314,7 @@ class _Comparer:
         return _Difference(np.inf, f"{name}: hooks took {a} packets in run A, and {b} in run B")
 
 
-def _packets(
+def packets_of_both(
     name: str, runs: tuple[PastRun, PastRun], recorded: RecordedPackets
 ) -> tuple[PacketLists, PacketLists]:
     """The lists of both runs, with digests from their bags where nodes have kept none.
@@ -327,6 +384,20 @@ def _consumed(name: str, in_a: PacketLists, in_b: PacketLists) -> _Difference | 
     else:
         what = f"hooks took different packets as number {place + 1}"
     return _Difference(at_ns, f"{name}: {what}")
+
+
+def _timed(name: str, in_a: PacketLists, in_b: PacketLists) -> _Difference | None:
+    """The first packet that was sent, or that a hook started on, at another virtual time."""
+    for what, a, b in (
+        ("packet {} was sent", in_a.sent_ns, in_b.sent_ns),
+        ("the hook of start {} started", in_a.taken_ns, in_b.taken_ns),
+    ):
+        place = _first_difference(a, b)
+        if place < min(len(a), len(b)):
+            times = f"at {a[place] / 1e9:.9g} s in run A, and at {b[place] / 1e9:.9g} s in run B"
+            text = f"{name}: {what.format(place + 1)} {times}"
+            return _Difference(float(a[place]), text)
+    return None
 
 
 def _first_difference(a: Numbers, b: Numbers) -> int:

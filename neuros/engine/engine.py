@@ -252,6 +252,13 @@ class Engine:
         self._pause.grant(count, self._arrivals, is_driven=is_driven)
         self._pass()
 
+    def reading(self, value: int) -> int:
+        """What a hook reads of something that goes on by itself, such as a clock."""
+        return value
+
+    def note_callback(self) -> None:
+        """A callback of a ROS entity that the plugin has made runs."""
+
     def stop_hooks(self) -> None:
         """Start no further hook; the packets of the running one are still sent. Any thread."""
         self._lifecycle.is_stopped = True

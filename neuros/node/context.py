@@ -191,6 +191,12 @@ class ContextSwitch:
         if forgets_modules:
             context.modules.clear()
 
+    def change(self, context: Context, variables: Mapping[str, str]) -> None:
+        """Give the context that is in place other values of these variables."""
+        self._differing.clear()
+        context.variables |= variables
+        os.environ.update(variables)
+
     def hide_from_nodes(self, project: Path) -> None:
         """Let nodes load modules below this folder anew, even if the process has them already."""
         self._process.project = str(project) + os.sep

@@ -62,7 +62,7 @@ class MuJoCo:
     ) -> None:
         self._node, self._clock, self._wait = node, clock, wait
         self._world = World(node, model, fine=fine_rendering)
-        self._view = WorldView(lambda: (self.model, self.data, self.sim_time))
+        self._view = WorldView(lambda: (self.model, self.data, self._world.time_s))
         self._lock = StepLock()
         self._unread: dict[str, Packet] = {}
         self._run: FreeRun | None = None
@@ -80,6 +80,7 @@ class MuJoCo:
         node.own_simulated_time(lambda: world.time.seconds(world.steps))
         node.show_world(self._view.observe)
         node.on_close(self.close)
+        node.on_change(self._change_fields, self._world.check_fields)
 
     # ---- what it is -------------------------------------------------------------------------
 
@@ -96,7 +97,8 @@ class MuJoCo:
     @property
     def sim_time(self) -> float:
         """Simulated seconds since the start, or the last reset; from any thread."""
-        return self._world.time_s
+        steps = self._seen_steps() if self.is_running else self._world.steps
+        return self._world.time.seconds(steps)
 
     @property
     def timestep(self) -> float:
@@ -192,12 +194,18 @@ class MuJoCo:
     def stop(self) -> None:
         """End :meth:`run_asynchronous`; the plugin may step again."""
         if self._run is not None:
+            is_running = self.is_running
             self._run.stop()
+            if is_running:
+                self._seen_steps()
+                self._unread.clear()
 
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Inside, no step runs: the place to touch ``model`` and ``data``. Nests."""
         with self._lock.visit():
+            if self.is_running:
+                self._seen_steps()
             yield
 
     def pause(self) -> None:
@@ -303,6 +311,17 @@ class MuJoCo:
         view.is_stepping = False
         if self._viewer is not None:
             self._viewer.sync()
+
+    def _change_fields(self) -> None:
+        with self.paused():
+            self._world.change_fields()
+
+    def _seen_steps(self) -> int:
+        """After how many steps a hook sees a world that steps itself; a replay goes on to there."""
+        steps = self._node.reading(self._world.steps)
+        if steps > self._world.steps:
+            self._advance_to(steps)
+        return steps
 
     def _refuse_while_running(self, what: str) -> None:
         if self._run is not None and self._run.is_running:

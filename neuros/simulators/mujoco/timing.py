@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from fractions import Fraction
 from functools import partial
 
-from neuros.ports import NodeContext, Packet
+from neuros.ports import Advance, NodeContext, Packet
 
 _LARGEST_DENOMINATOR = 1_000_000
 _TIMESTEP_TOLERANCE = Fraction(1, 10_000_000)
@@ -231,7 +231,7 @@ class FreeRun:
     It begins at time 0 of the run, and ends when the simulated time of the run is over. Sending
     waits while a reliable connection is blocked; visitors of the lock may use model and data
     meanwhile. An error ends the node. In virtual time there is no thread: events of the node do
-    this, at the times of the virtual clock.
+    this, at the times of the virtual clock. In a replay, the node advances the world.
 
     Args:
         advance: runs one bout and returns the packets that are due after it, by output.
@@ -246,7 +246,7 @@ class FreeRun:
         self,
         node: NodeContext,
         lock: StepLock,
-        advance: Callable[[], Mapping[str, Packet]],
+        advance: Advance,
         sim_time: Callable[[], float],
         finish: Callable[[], None],
         idle: Callable[[], None] | None,
@@ -259,7 +259,7 @@ class FreeRun:
         self._idle = idle
         self._stopped = threading.Event()
         self._virtual = node.virtual_time
-        self._is_virtual_run = False
+        self._is_without_thread = False
         if self._virtual is not None:
             clock = self._virtual.clock_s
         self.pacer = Pacer(factor, clock, wait or self._stopped.wait)
@@ -269,23 +269,22 @@ class FreeRun:
 
     @property
     def is_running(self) -> bool:
-        is_alive = self._is_virtual_run or self._thread.is_alive()
+        is_alive = self._is_without_thread or self._thread.is_alive()
         return is_alive and not self._stopped.is_set()
 
     def start(self) -> None:
-        if self._virtual is None:
+        self._is_without_thread = self._node.drive(self._advance) or self._virtual is not None
+        if not self._is_without_thread:
             self._thread.start()
-        else:
-            self._is_virtual_run = True
+        elif self._virtual is not None:
             self._virtual.when_active(self._start_in_virtual_time)
 
     def stop(self) -> None:
         """End the thread and wait for its end; callable again, and in the thread itself."""
         self._stopped.set()
         self._lock.wake()
-        if self._virtual is not None:
-            self._is_virtual_run = False
-        elif self._thread is not threading.current_thread():
+        is_own = self._thread is threading.current_thread()
+        if not self._is_without_thread and not is_own:
             self._thread.join(_JOIN_S)
 
     def _run(self) -> None:
