@@ -97,8 +97,8 @@ class Packets(Protocol):
     def packet_class(self, type_name: str) -> type:
         """The message class of a type, or NumPy's array. Raises ``EnvironmentFault``."""
 
-    def make(self, type_name: str) -> Packet:
-        """A new message with default values, or an array of zeros."""
+    def maker(self, type_name: str) -> Callable[[], Packet]:
+        """A function that makes a new message with default values, or an array of zeros."""
 
     def checker(self, type_name: str, *, for_jpeg: bool = False) -> Callable[[Packet], Packet]:
         """A check of packets of a type, also for JPEG.
@@ -201,6 +201,15 @@ class NodeLoop(NodeEvents, Protocol):
     @property
     def zero_ns(self) -> int: ...
 
+    def announce(self, duration_ns: int) -> None:
+        """The hook that starts now takes at least so long."""
+
+    def ready(self) -> None:
+        """The initialise hooks have run, but for those that wait for packets."""
+
+    def at_zero(self, event: Callable[[], None], first_pass: Callable[[], None]) -> None:
+        """Handle two events at time 0 of the run; the second after the first of all nodes."""
+
     def hold(self, duration_ns: int) -> None:
         """The hook that has just run takes so long."""
 
@@ -213,8 +222,11 @@ class NodeLoop(NodeEvents, Protocol):
     def end(self, drain_s: float) -> None:
         """The node asks for the end: nothing happens after this instant until :meth:`drain`."""
 
-    def drain(self, event: Callable[[], None], stop: Callable[[], None]) -> None:
-        """Handle ``event`` when the end reaches the node; ``stop`` it if it drains for too long."""
+    def drain(self, event: Callable[[], None], stop: Callable[[], None], *, is_asked: bool) -> None:
+        """Handle ``event`` when the end reaches the node; ``stop`` it if it drains for too long.
+
+        ``is_asked``: a node has asked for the end; else it is now.
+        """
 
 
 class VirtualRun(EventLoop, Protocol):
@@ -340,6 +352,10 @@ class VirtualClock(Protocol):
         """Send packets, by output, as soon as a hook could; then call ``sent``."""
 
 
+Advance: TypeAlias = "Callable[[], Mapping[str, Packet]]"
+"""Steps a world that runs by itself, to packets that are due or less far; returns them."""
+
+
 class NodeContext(Protocol):
     """The node handle of hooks, as far as simulators need it."""
 
@@ -385,6 +401,12 @@ class NodeContext(Protocol):
     def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
         """Wait for time 0 of the run; False if ``cancelled()`` or the node ends. Other threads."""
 
+    def reading(self, value: int) -> int:
+        """A reading of what goes on by itself: that of the run in a replay, else the value."""
+
+    def drive(self, advance: Advance) -> bool:
+        """Whether the node advances a world that runs by itself, so that no thread has to."""
+
     def show_world(self, look: WorldLook) -> None:
         """Show a simulated world to observers; see :mod:`neuros.simulators.mujoco.scene`."""
 
@@ -396,6 +418,13 @@ class NodeContext(Protocol):
 
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
+
+    def on_change(
+        self,
+        callback: Callable[[], object],
+        check: Callable[[Mapping[str, str]], object] = lambda _: None,
+    ) -> None:
+        """Call ``callback`` when a fork has changed the environment, and ``check`` before."""
 
     def fail(self, error: BaseException) -> None:
         """End the node with an error from outside of hooks. Any thread."""

@@ -49,7 +49,6 @@ from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
 from neuros.options import recorded_values
-from neuros.ordinary_files import open_log
 from neuros.ports import Shown, View
 from neuros.recording.recording_plan import RecordingPlan
 
@@ -241,6 +240,7 @@ class Execution:
             "namespace": self._plan.project.names.namespace,
             "started": started,
             "options": recorded_values(self._plan.request),
+            **self._plan.provenance,
             **observed,
         }
         # Nodes of other machines are in percent of a core there.
@@ -427,7 +427,7 @@ class Console:
         """
         if severity == "DEBUG":
             record = format_record(severity, "neuros", text)
-            with contextlib.suppress(OSError), open_log(self._log_file) as log:
+            with contextlib.suppress(OSError), open(self._log_file, "ab") as log:
                 log.write(f"{record}\n".encode(errors="backslashreplace"))
             return
         self.poll()

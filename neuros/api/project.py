@@ -9,6 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +38,7 @@ from neuros.project.split import project_to_json
 from neuros.registry import AUTO, own_packages
 
 if TYPE_CHECKING:
-    from neuros.api.session import Session
+    from neuros.api.session import Prepare, Session
 
 LOCAL, IN_PROCESS = "local", "in-process"
 
@@ -84,6 +85,11 @@ class SessionOptions(StartOptions):
         default=False,
         page="python.md#sessions",
         help="let ROS tools see the topics of nodes that are in the thread of this program",
+    )
+    forkable: bool = option(
+        default=False,
+        page="python.md#forks",
+        help="keep the packets that the session sends, so that a fork of it can send them again",
     )
     take_over: Sequence[str] = option(
         is_repeatable=True,
@@ -216,6 +222,10 @@ class Project:
         """
         return self._load_for_run(StartOptions(set=settings, seed=seed), is_held=is_held)[0]
 
+    def described(self, options: StartOptions) -> Described:
+        """The model of the project, checked as a run with these options does it."""
+        return self._load_for_run(options)[0]
+
     def text(self) -> str:
         """The whole project as JSON, node files merged in."""
         return json.dumps(project_to_json(self._loaded.project), sort_keys=True)
@@ -301,28 +311,49 @@ class Project:
             ProjectError, UsageError, EnvironmentFault: as :meth:`run` does.
             RunError: if the run has ended already.
         """
-        from neuros.api.local_run import LocalRun  # brings rclpy
         from neuros.api.session import Session
-        from neuros.api.session_link import Held, HeldRun, LaunchedRun, with_session_inputs
+        from neuros.api.session_link import with_session_inputs
 
         if options.expose and options.backend != LOCAL:
             raise UsageError(
                 f"expose: ROS tools see the topics of the back end {options.backend} anyway"
             )
+        prepare = self._preparer(options, partial(with_session_inputs, taken=options.take_over))
+        return Session(prepare, options.seed, is_forkable=options.forkable)
+
+    def held(self, options: StartOptions, fork: Mapping[str, Any]) -> Session:
+        """Start a run that stands still, with all that a run without a session has.
+
+        Args:
+            fork: of which run it is a fork, for its record.
+
+        Raises:
+            ProjectError, UsageError, EnvironmentFault: as :meth:`run` does.
+        """
+        from neuros.api.session import Session
+
+        return Session(self._preparer(options, lambda project: (project, ())), options.seed, fork)
+
+    def _preparer(
+        self, options: StartOptions, bind: Callable[[Described], tuple[Described, Sequence[str]]]
+    ) -> Prepare:
+        """What starts the runs of a session, whose inputs ``bind`` names."""
+        from neuros.api.local_run import LocalRun  # brings rclpy
+        from neuros.api.session import Prepared
+        from neuros.api.session_link import Held, HeldRun, LaunchedRun
+
         count = itertools.count(1)
 
-        def prepare(
-            seed: int | None, settings: Mapping[str, Any]
-        ) -> Callable[[Mapping[str, Any]], Held]:
+        def prepare(seed: int | None, settings: Mapping[str, Any]) -> Prepared:
             wanted = options.set
             if isinstance(wanted, Mapping):
                 wanted = with_model_fields(self._loaded.project, wanted)
             given = [*override_texts(wanted), *override_texts(settings)]
             chosen = replace(options, seed=seed, set=given)
             project, messages = self._load_for_run(chosen, is_held=True)
-            held, inputs = with_session_inputs(project, options.take_over)
+            held, inputs = bind(project)
 
-            def start(restore: Mapping[str, Any]) -> Held:
+            def start(restore: Mapping[str, Any], fork: Mapping[str, Any]) -> Held:
                 number, output = next(count), None
                 if options.output is not None:  # out, out-2, out-3
                     output = os.fspath(options.output) + (f"-{number}" if number > 1 else "")
@@ -332,17 +363,18 @@ class Project:
                 if options.backend == LOCAL:
                     plan = make_plan(held, messages, replace(own, backend=IN_PROCESS))
                     make_environments(plan.pythons, messages, sys.stderr)
-                    plan = replace(plan, request=own)
-                    run = LocalRun(plan, messages.paths, exposes=options.expose)
+                    plan = replace(plan, request=own, fork=fork)
+                    is_exposed = getattr(options, "expose", False)
+                    run = LocalRun(plan, messages.paths, exposes=is_exposed)
                 else:
-                    live = self._live(held, messages, own, is_held=True)
+                    live = self._live(held, messages, own, is_held=True, fork=fork)
                     live.begin()
                     run = LaunchedRun(live, len(project.nodes))
                 return Held(run, project, frozenset(inputs), messages.paths)
 
-            return start
+            return Prepared(project, start, is_stepped=options.backend == LOCAL)
 
-        return Session(prepare, options.seed)
+        return prepare
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the path: the files are read again."""
@@ -363,6 +395,7 @@ class Project:
         options: StartOptions,
         *,
         is_held: bool = False,
+        fork: Mapping[str, Any] | None = None,
     ) -> LiveRun:
         for node in project.nodes:
             if not node.hooks:
@@ -373,7 +406,12 @@ class Project:
                     " the project with to_json(folder), and start that"
                 )
             PluginText(node.name, node.hooks)  # fails before there is a run folder
-        plan = replace(make_plan(project, messages, options), is_held=is_held)
+        plan = replace(make_plan(project, messages, options), is_held=is_held, fork=fork or {})
+        if is_held and project.is_virtual and not plan.back_end.is_one_process:
+            raise UsageError(
+                f"backend: a session cannot hold nodes of the back end {plan.back_end.name} in"
+                " virtual time, since they are in several processes: leave backend out"
+            )
         if options.isolate and not plan.back_end.has_own_network:
             raise UsageError(
                 "isolate: a Python program cannot give a run a network of its own: use"

@@ -255,7 +255,7 @@ def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None
         plan.names,
         wanted,
         is_alone=not is_open and "ROS_DOMAIN_ID" not in environ,
-        custom=_custom_data(plan.project),
+        custom={**_custom_data(plan.project), "backend": plan.back_end.name},
     )
 
 
@@ -291,6 +291,7 @@ def _custom_data(project: Project) -> dict[str, str]:
             continue
     return {
         "project": project.name,
+        "file": str(project.file),
         "project_sha256": hashlib.sha256(content.encode()).hexdigest(),
         "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "versions": json.dumps(versions),

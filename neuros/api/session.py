@@ -18,18 +18,21 @@ import time
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from neuros.api.changes import Changes, changes_of
 from neuros.api.live import PROGRAM_FAILED, why_it_ended
 from neuros.api.loading import seed_variables, value_text, with_model_fields
 from neuros.api.run import Run
 from neuros.api.run_record import run_table
 from neuros.api.session_link import (
     Held,
+    LaunchedRun,
     connections_to,
     declared_at,
     port_of,
@@ -38,17 +41,35 @@ from neuros.control import AtRest, NodeStatus
 from neuros.errors import NeurosError, RunError, UsageError
 from neuros.node.instruments import room_for
 from neuros.project.graph import graph_svg
-from neuros.project.model import Node, Port
+from neuros.project.model import Node, Port, Project
+from neuros.project.repeatable import why_not_repeatable
 from neuros.project.suggest import did_you_mean, listed
-from neuros.transport.messages import checked
+from neuros.transport.messages import RosPackets, checked
 
 _READ_S = 1.0
 _LONGEST_S = 1e6  # operating systems wait for no more than some weeks
 _MOST_ROUNDS_AT_REST = 1000
 _FINE = 1e-9
 _MOST_VARIATION = 2.0
-Prepare = Callable[[int | None, Mapping[str, Any]], Callable[[Mapping[str, Any]], Held]]
-"""Checks a run with a seed and settings; what it returns starts that, with values to restore."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run that was checked.
+
+    Attributes:
+        project: as it is described, without the inputs of the session.
+        start: starts it, with values to restore, and with what is recorded of a fork.
+        is_stepped: whether all nodes are in the thread of the program.
+    """
+
+    project: Project
+    start: Callable[[Mapping[str, Any], Mapping[str, Any]], Held]
+    is_stepped: bool
+
+
+Prepare = Callable[[int | None, Mapping[str, Any]], Prepared]
+"""Checks a run with a seed and settings."""
 
 
 class Session:
@@ -69,16 +90,28 @@ class Session:
         runs: those that a reset has ended; each has a folder of its own.
     """
 
-    def __init__(self, prepare: Prepare, seed: int | None) -> None:
+    def __init__(
+        self,
+        prepare: Prepare,
+        seed: int | None,
+        fork: Mapping[str, Any] | None = None,
+        *,
+        settings: Mapping[str, Any] | None = None,
+        is_forkable: bool = False,
+    ) -> None:
         self._prepare = prepare
         self._seed = seed
+        self._is_forkable = is_forkable
+        self._journal: list[tuple[str, tuple[Any, ...]]] = []  # what a fork does again
+        self._why_no_fork = ""
         self._lock = threading.RLock()
         self._outputs: dict[str, _Received] = {}
         self.runs: list[Run] = []
-        self._settings: Mapping[str, Any] = {}  # of the reset with which the run began
+        self._settings: Mapping[str, Any] = settings or {}  # with which the run began
+        self._latest = self._settings  # of the last reset, whether it began a run or not
         self._checked: set[str] = set()  # paths of settings
-        self._hold(prepare(seed, {})({}))
-        self._usual = self._project
+        self._hold(prepare(seed, self._settings).start({}, fork or {}))
+        self._usual = self._project if not settings else prepare(seed, {}).project
 
     def _hold(self, held: Held) -> None:
         """Take a run that has just been started."""
@@ -100,6 +133,8 @@ class Session:
             received.begin_anew()
         self._known = dict.fromkeys(self._outputs, 0)
         self._sim_times: Mapping[str, float] = {}
+        self._journal = []
+        self._why_no_fork = ""
 
     # ------------------------------------------------------------------ time
 
@@ -148,8 +183,9 @@ class Session:
             self._check_running()
             if until is not None and self._held.is_behind and not self._advance(0, end_s):
                 return False
-            for _ in self._rounds(count, sim_s, until):
-                if not self._advance(1, end_s):
+            is_counted = sim_s is None and until is None
+            for _ in range(count) if is_counted else self._rounds(sim_s, until):
+                if not self._take(self._held.advance(1, self._known, end_s)):
                     return False
             return self.is_running  # `until` may have closed it
 
@@ -175,6 +211,7 @@ class Session:
             if duration_s is None:
                 return self._run_sim(check_seconds(duration_sim_s=duration_sim_s))
             duration_s = check_seconds(duration_s=duration_s)
+            self._why_no_fork = "it ran for a wall time (run(duration_s=...)): use duration_sim_s"
             return self._take(self._held.run_for(duration_s, self._known))
 
     def reset(
@@ -215,12 +252,121 @@ class Session:
                 self._prepare(seed, settings)  # says what is wrong with them
                 self._checked |= settings.keys()
             if not self._reset_in_place(seed, settings, kept):
-                start = self._prepare(seed, settings)  # what is wrong ends no run
+                start = self._prepare(seed, settings).start  # what is wrong ends no run
                 run = self.close("the session was reset")
                 self.runs.append(run)
-                self._hold(start({f"{node}.{name}": run for node in kept for name in kept[node]}))
+                values = {f"{node}.{name}": run for node in kept for name in kept[node]}
+                self._hold(start(values, {}))
                 self._settings = settings
-            self._seed = seed
+            self._seed, self._latest = seed, settings
+            if kept:
+                self._why_no_fork = "values were kept over its reset: reset it without keep"
+
+    def fork(self, *, set: Mapping[str, Any] | None = None) -> Session:
+        """A second session, which has come to where this one stands, and goes on by itself.
+
+        It is a run of its own, executed again from the start of this one, or from its last reset:
+        the same rounds, on the same packets. This session is not changed.
+
+        Args:
+            set: values that change there, by path: ``nodes.robot.environment.RATE``,
+                ``nodes.robot.parameters.speed``, ``robot.model.geom_friction``. Hooks that read
+                them from then on see them; a plugin that read them before can ask for a call
+                (``node.on_change``).
+
+        Raises:
+            UsageError: if it cannot be repeated, with all reasons; for a path that a fork cannot
+                change.
+            ProjectError, EnvironmentFault: as for the start of a session.
+            RunError: if it has ended, if it comes to another place, or if a node refuses a change.
+        """
+        with self._lock:
+            self._check_running()
+            prepared = self._prepare(self._seed, self._latest)
+            why = why_not_repeatable(prepared.project, is_stepped=prepared.is_stepped)
+            why += [self._why_no_fork] if self._why_no_fork else []
+            if why:
+                raise UsageError(
+                    "\n".join(["the session cannot be forked:", *(f"  {each}" for each in why)])
+                )
+            changes = changes_of(
+                prepared.project,
+                set or {},
+                lambda more: self._prepare(self._seed, {**self._latest, **more}).project,
+            )
+            counts, journal = self.sent_counts(), [*self._journal]
+            about = {
+                "run": str(self.folder),
+                "at_sim_s": self.sim_time,
+                "set": {path: value_text(path, value) for path, value in (set or {}).items()},
+            }
+            other = Session(
+                self._prepare,
+                self._seed,
+                about,
+                settings=self._latest,
+                is_forkable=self._is_forkable,
+            )
+        try:
+            other.change(changes, only_checks=True)
+            for what, arguments in journal:
+                if what == "advance":
+                    other._advance(arguments[0], None, arguments[1])
+                elif what == "send":
+                    other._held.deliver(*arguments)
+                    other._note(what, *arguments)
+                else:
+                    other.change(*arguments)
+            if (found := other.sent_counts()) != counts:
+                name = next(name for name in counts if counts[name] != found.get(name))
+                raise RunError(
+                    f"the fork has come to another place: {found.get(name)} packets on {name}, and"
+                    f" {counts[name]} in this session: does a plugin use wall time, or random"
+                    " numbers without a seed?",
+                    1,
+                )
+            other.change(changes)
+        except BaseException as error:
+            other._held.interrupt(*why_it_ended(error))
+            raise
+        return other
+
+    def change(self, changes: Changes, *, only_checks: bool = False) -> None:
+        """Change environments and parameters of nodes, which go on from where they are.
+
+        Args:
+            only_checks: whether to check that this is possible, and to change nothing.
+
+        Raises:
+            RunError: if a node refuses that, which ends the run.
+        """
+        if changes and not self._take(self._held.change(changes, only_checks=only_checks)):
+            self._check_running()
+        if changes and not only_checks:
+            self._note("change", changes)
+
+    def sent_counts(self) -> dict[str, int]:
+        """By connection, how many packets were sent. Raises ``RunError`` if the run has ended."""
+        metrics = [status.counters.metrics for status in self.state().values() if status.counters]
+        return {name: sent["sent"] for each in metrics for name, sent in each["outgoing"].items()}
+
+    def finish(self) -> Run:
+        """Let the run go freely to its own end, and return what it has left behind."""
+        with self._lock:
+            if self._run is None:
+                assert isinstance(self._held, LaunchedRun)
+                self._held.resume()
+                self._end()
+            assert self._run is not None
+            return self._run
+
+    def _note(self, name: str, *arguments: Any) -> None:
+        """Remember what a fork has to do again."""
+        last = self._journal[-1] if self._journal else ("", ())
+        if name == last[0] == "advance" and arguments[1] is last[1][1] is None:
+            self._journal[-1] = name, (arguments[0] + last[1][0], None)
+        else:
+            self._journal.append((name, arguments))
 
     def _kept(self, asked: bool | str | Sequence[str]) -> dict[str, list[str]]:
         """The names of the values that a reset keeps, by node."""
@@ -316,6 +462,14 @@ class Session:
         with self._lock:
             self._check_running()
             self._held.deliver(node.name, port.name, packet)
+            if self._is_forkable:
+                own = RosPackets().copier(port.type)(packet)
+                self._note("send", node.name, port.name, own)
+            elif not self._why_no_fork:
+                self._why_no_fork = (
+                    f"{input_name} was sent packets that are not kept: begin it with"
+                    " session(forkable=True)"
+                )
 
     def _input(self, input_name: str) -> tuple[Node, Port]:
         node, port = port_of(self._project, input_name, is_input=True)
@@ -392,21 +546,19 @@ class Session:
     # ------------------------------------------------------------------ inside
 
     def _rounds(
-        self, rounds: int, sim_s: float | None, until: Callable[[Session], object] | None
+        self, sim_s: float | None, until: Callable[[Session], object] | None
     ) -> Iterator[None]:
         """As many turns as there are rounds to go."""
         if until is not None:
             while not until(self):
                 yield
-        elif sim_s is not None:
+        if sim_s is not None:
             end_s = self._sim_now() + sim_s
             at_rest = 0
             while (now_s := self._sim_now()) < end_s - _FINE:
                 yield
                 at_rest = 0 if self._sim_now() > now_s else at_rest + 1
                 self._check_progress(at_rest)
-        else:
-            yield from (None for _ in range(rounds))
 
     def _run_sim(self, duration_s: float) -> bool:
         """Grant many rounds at once, but none that is to begin after the end.
@@ -448,6 +600,8 @@ class Session:
         self, rounds: int, end_s: float | None = None, end_sim_s: float | None = None
     ) -> bool:
         """Go on by rounds, and wait until nothing moves; whether the run goes on."""
+        if rounds:
+            self._note("advance", rounds, end_sim_s)
         return self._take(self._held.advance(rounds, self._known, end_s, end_sim_s))
 
     def _take(self, answer: AtRest | None) -> bool:
@@ -573,6 +727,14 @@ class SessionOutput:
         return self._session._copy(self._port, received.newest) if received.count else None
 
     @property
+    def shared_packet(self) -> Any:
+        """As :attr:`packet`, without a copy: nobody may change it."""
+        received = self._session._received(self.name)
+        if not received.count:
+            return None
+        return self._session._held.view(self._port.type, received.newest)
+
+    @property
     def packets(self) -> list[Any]:
         """The packets since this was looked at last, oldest first.
 
@@ -685,6 +847,8 @@ def check_length(
     Raises:
         UsageError: for it, and for more than one.
     """
+    if rounds is None and sim_s is None and until is None:
+        return 1
     given = {"rounds": rounds, "sim_s": sim_s, "until": until}
     names = [name for name, value in given.items() if value is not None]
     if len(names) > 1:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from neuros.api.changes import Changes
 from neuros.api.live import LiveRun
 from neuros.api.run import Run
 from neuros.backends.control_sockets import connect
@@ -16,9 +17,10 @@ from neuros.control import (
     TO_OBSERVERS,
     Advance,
     AtRest,
+    Change,
     Deliver,
     Ended,
-    LookAll,
+    GetStatus,
     Message,
     NodeStatus,
     Pause,
@@ -91,6 +93,9 @@ class HeldRun(Protocol):
     def copy(self, type_name: str, content: Any) -> Any:
         """A packet of its own for the program, from the content that came with an answer."""
 
+    def view(self, type_name: str, content: Any) -> Any:
+        """The packet of such a content, which nobody may change."""
+
     def size_of(self, content: Any) -> int:
         """The bytes of the content of a packet."""
 
@@ -102,6 +107,13 @@ class HeldRun(Protocol):
         Args:
             variables: of their environments that change, by node.
             keep: names of the values of their plugins that survive, by node.
+        """
+
+    def change(self, changes: Changes, *, only_checks: bool = False) -> AtRest | None:
+        """Change environments and parameters of nodes, which go on from where they are.
+
+        Args:
+            only_checks: whether to check that this is possible, and to change nothing.
         """
 
     def look(self) -> Sequence[NodeStatus] | None:
@@ -194,6 +206,8 @@ class LaunchedRun:
     def copy(self, type_name: str, content: bytes) -> Any:
         return self._packets.decode(type_name, content)
 
+    view = copy
+
     def size_of(self, content: bytes) -> int:
         return len(content)
 
@@ -207,6 +221,15 @@ class LaunchedRun:
         answer = self._answer(WasReset, lambda _: True, None)
         return answer is not None and not answer.why_not
 
+    def change(self, changes: Changes, *, only_checks: bool = False) -> AtRest | None:
+        for node, (variables, parameters) in changes.items():
+            self._send(Change(node, variables, parameters, only_checks))
+        return self.advance(0, {})
+
+    def resume(self) -> None:
+        """Let the run go freely from now on."""
+        self._send(Resume())
+
     def look(self) -> Sequence[NodeStatus] | None:
         found: dict[str, NodeStatus] = {}
 
@@ -217,7 +240,7 @@ class LaunchedRun:
 
         if not self.is_behind:  # else a round goes on, perhaps for ever
             self.advance(0, {})  # what was sent has arrived then
-        self._send(LookAll({}))
+        self._send(GetStatus({}))
         return [*found.values()] if self._wait_for(is_last, None) else None
 
     def stop(self, reason: str) -> None:

@@ -156,6 +156,39 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> RunComparison:
     return comparer.result()
 
 
+def first_difference(
+    a: PastRun, b: PastRun, counts: Mapping[str, int], recorded: RecordedPackets
+) -> tuple[int, str]:
+    """Compare the first packets of connections: how many, and in which one the runs differ first.
+
+    Args:
+        counts: by connection, how many packets to compare.
+    """
+    compared, differences = 0, []
+    for name in (name for name in counts if name in a.connections and name in b.connections):
+        in_a, in_b = (
+            _between(each, 0, counts[name]) for each in packets_of_both(name, (a, b), recorded)
+        )
+        compared += _first_difference(in_a.sent, in_b.sent)
+        found = _sent(name, in_a, in_b)
+        if found is not None and not in_a.sent_before + in_b.sent_before:
+            differences.append(found)
+    if not differences:
+        return compared, ""
+    return compared, _told(min(differences, key=lambda each: each.at_ns), (a, b), recorded)
+
+
+def _told(first: _Difference, runs: tuple[PastRun, PastRun], recorded: RecordedPackets) -> str:
+    """A difference with the field in which it lies, if the runs were recorded."""
+    if first.packet is None:
+        return first.text
+    messages = [recorded.message(run.folder, *first.packet) for run in runs]
+    if None in messages:
+        return f"{first.text} (to see in which field, run both with --record)"
+    field = next(differing_fields(*messages), None)
+    return first.text + (f" in {field}" if field else " (but no recorded field does)")
+
+
 class _Comparer:
     """Compares two runs, connection by connection."""
 
@@ -172,18 +205,11 @@ class _Comparer:
         text, cause = None, ""
         if self.differences:
             first = min(self.differences, key=lambda difference: difference.at_ns)
-            text = first.text
             others = len(self.differences) - 1
             if others:
                 differ = "connections differ" if others > 1 else "connection differs"
                 self._remarks.append(f"{others} more {differ}, from a later moment on")
-            if first.packet is not None:  # a bag is read for the first difference only
-                messages = [self._recorded.message(run.folder, *first.packet) for run in self._runs]
-                if None in messages:
-                    text += " (to see in which field, run both with --record)"
-                else:
-                    field = next(differing_fields(*messages), None)
-                    text += f" in {field}" if field else " (but no recorded field does)"
+            text = _told(first, self._runs, self._recorded)
             records = [run.record for run in self._runs]
             cause = differences(*(record.get("arithmetic") or {} for record in records))
             if cause and not all(record.get("is_portable") for record in records):
@@ -199,7 +225,7 @@ class _Comparer:
 
     def compare(self, name: str) -> None:
         """Compare the packets of a connection that both runs have."""
-        both = _packets(name, self._runs, self._recorded)
+        both = packets_of_both(name, self._runs, self._recorded)
         counts = [run.connections[name]["sent"] for run in self._runs]
         lacking = [
             str(run.folder)
@@ -266,7 +292,7 @@ class _Comparer:
         return _Difference(np.inf, f"{name}: hooks took {a} packets in run A, and {b} in run B")
 
 
-def _packets(
+def packets_of_both(
     name: str, runs: tuple[PastRun, PastRun], recorded: RecordedPackets
 ) -> tuple[PacketLists, PacketLists]:
     """The lists of both runs, with digests from their bags where nodes have kept none.

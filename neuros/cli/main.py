@@ -61,6 +61,9 @@ COMMANDS = {
         "neuros.cli.setup", "measure what NeuROS costs, compared with the same program without it"
     ),
     "reproduce": Subcommand("neuros.cli.setup", "repeat the published experiments"),
+    "fork": Subcommand(
+        "neuros.cli.fork", "run a past run again up to a moment, then go on with a change"
+    ),
     "node": Subcommand("neuros.cli.node"),
     "import-plugin": Subcommand("neuros.cli.projects"),
     "recorder": Subcommand("neuros.cli.recorder"),

@@ -1,9 +1,10 @@
-"""``neuros replay``: a recorded run replayed to one node, or published on the ROS graph."""
+"""``neuros replay``: the nodes of a recorded run replayed, or its topics published on ROS."""
 
 from __future__ import annotations
 
 import argparse
 import atexit
+import contextlib
 import faulthandler
 import json
 import math
@@ -15,57 +16,77 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from neuros.distribution import python_command
+from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.options import positive_number
 from neuros.project.suggest import counted
 
 if TYPE_CHECKING:
     from neuros.api.run_record import PastRun
+    from neuros.bag import RecordedTopic
     from neuros.hooks import HookSpec
-    from neuros.project.model import NodeFile
+    from neuros.replay.node_replay import NodeVerdict
     from neuros.replay.replayed_node import ReplayedNode
 
 
 _LEAST_RATE, _LONGEST_DELAY_S = 1e-6, 1e6
 _HIGHEST_PORT = (1 << 16) - 1
 
-EXIT_IDENTICAL, EXIT_DIFFERENT, EXIT_UNKNOWN, EXIT_LEFT = 0, 1, 2, 130
+EXIT_LEFT = 130
+_EXIT_CODES = {"different": 1, "not replayed": 4, "unknown": 2, "identical": 0}
+"""By verdict on a node; of several nodes, the first of these counts."""
 
 
 def add_replay(replay: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
     replay.description = (
-        "With --node: run one node again on exactly the packets that it received, and compare what"
-        " it sends, packet by packet. With --topic: publish recorded topics on the ROS graph, at"
-        " the intervals of the run."
+        "Run every node of a recorded run again on exactly the packets that it received, and"
+        " compare what it sends, packet by packet. With --node: only this one. With --topic:"
+        " publish recorded topics on the ROS graph, at the intervals of the run."
     )
     replay.epilog = (
-        "exit codes of --node: 0 identical, 1 different, 2 nothing to compare,"
-        " 4 the node needs what this machine does not have"
+        "exit codes: 0 all nodes are identical, 1 a node is different, 2 nothing to compare,"
+        " 4 a node needs what this machine does not have"
     )
     add = replay.add_argument
     add("run", metavar="RUN", help="the run folder, or a bag")
-    add("-n", "--node", metavar="NAME", help="the node to run again")
+    add(
+        "-n",
+        "--node",
+        action="append",
+        default=[],
+        dest="nodes",
+        metavar="NAME",
+        help="a node to run again (repeatable; default: all); one alone has the terminal",
+    )
+    add(
+        "-j",
+        "--jobs",
+        type=positive_number,
+        metavar="N",
+        help="run so many nodes at a time (default: one for each core)",
+    )
+    add_format(replay)
     debugger = replay.add_mutually_exclusive_group()
     debugger.add_argument(
         "--pdb",
         "--debug",
         action="store_true",
-        help="with --node: run it in Python's debugger, which stops at the start of each hook, and"
-        " after a failure",
+        help="with one --node: run it in Python's debugger, which stops at the start of each hook,"
+        " and after a failure",
     )
     debugger.add_argument(
         "--debugpy",
         type=int,
         metavar="PORT",
-        help="with --node: wait until an editor's debugger attaches to this port (pip install"
+        help="with one --node: wait until an editor's debugger attaches to this port (pip install"
         " debugpy)",
     )
     add(
         "-o",
         "--output",
         metavar="FOLDER",
-        help="with --node: keep the files that the node writes (node.run_dir) in this folder"
+        help="keep the files that nodes write (node.run_dir), and their logs, in this folder"
         " (default: remove them)",
     )
     add(
@@ -102,31 +123,61 @@ def add_replay(replay: argparse.ArgumentParser) -> None:
         metavar="ID",
         help="publish in this ROS domain (default: ROS_DOMAIN_ID, else 0)",
     )
+    add(
+        "-p",
+        "--project",
+        metavar="PROJECT",
+        default=".",
+        help="with --remap: the project of the node (default: the current folder)",
+    )
+    add(
+        "--remap",
+        action="append",
+        default=[],
+        metavar="TOPIC:=NODE.PORT",
+        help="with --node, of a bag of any program: give this topic to an input of the node, or in"
+        " the place of an output that the input is connected with (repeatable)",
+    )
     replay.set_defaults(command=_replay)
 
 
 def add_replayed(replayed: argparse.ArgumentParser) -> None:
-    """Add the arguments of the program that ``replay --node`` becomes."""
+    """Add the arguments of the program that replays one node."""
     replayed.add_argument("node_file")
     replayed.add_argument("--run", required=True)
     replayed.add_argument("--pdb", action="store_true")
     replayed.add_argument("--debugpy", type=int)
     replayed.add_argument("--remove", action="store_true")
+    replayed.add_argument("--verdict", type=Path)
     replayed.set_defaults(command=_replayed)
 
 
 def _replay(options: argparse.Namespace) -> int:
     if options.debugpy is not None and not 0 < options.debugpy <= _HIGHEST_PORT:
         raise UsageError(f"replay: --debugpy must be a port from 1 to {_HIGHEST_PORT}")
-    if options.node is not None:
-        return _replay_node(options)
-    if options.pdb or options.debugpy is not None or options.output is not None:
-        raise UsageError("replay: --pdb, --debugpy and --output need --node NAME")
-    if not options.replay_topics:
-        raise UsageError(
-            "replay: name a node to run again (--node NAME), or what to publish (--topic NAME, or"
-            " --topic '*' for all)"
-        )
+    if options.remap:
+        return _replay_bag(options)
+    has_debugger = options.pdb or options.debugpy is not None
+    if has_debugger and len(options.nodes) != 1:
+        raise UsageError("replay: --pdb and --debugpy need one --node NAME")
+    if options.replay_topics:
+        if options.nodes or options.jobs is not None or options.output is not None:
+            raise UsageError(
+                "replay: --topic publishes; --node, --jobs and --output run nodes: choose one"
+            )
+        return _publish(options)
+    from neuros.replay.recorded_node import recorded_run, require_end
+
+    run = recorded_run(Path(options.run).absolute())
+    require_end(run)
+    if len(options.nodes) == 1 and options.format != JSON:
+        return _replay_node(options, run)
+    if has_debugger:
+        raise UsageError("replay: --pdb and --debugpy have the terminal: leave --format json out")
+    return _replay_nodes(options, run)
+
+
+def _publish(options: argparse.Namespace) -> int:
     if not _LEAST_RATE <= options.rate < math.inf:
         raise UsageError(f"replay: --rate must be {_LEAST_RATE:g} or more, and finite")
     if not 0 <= options.delay <= _LONGEST_DELAY_S:
@@ -136,7 +187,6 @@ def _replay(options: argparse.Namespace) -> int:
     from neuros.backends.domain import given_domain
     from neuros.bag import open_bag
     from neuros.cli.environments import find_messages_of
-    from neuros.recording.recording_plan import is_named
     from neuros.transport.ros_topics import RosTopic, play
 
     domain_id = given_domain(options.domain_id, os.environ)
@@ -144,12 +194,7 @@ def _replay(options: argparse.Namespace) -> int:
     with open_bag(options.run) as bag:
         if bag.damage is not None:
             print(f"neuros: {bag.damage}", file=sys.stderr)
-        topics, patterns = [*bag.topics.values()], options.replay_topics
-        for pattern in patterns:
-            if not any(is_named(t.name, t.connection, [pattern]) for t in topics):
-                there = ", ".join(t.connection or t.name for t in topics)
-                raise UsageError(f"--topic {pattern}: the bag has no such topic; it has {there}")
-        chosen = [t for t in topics if is_named(t.name, t.connection, patterns)]
+        chosen = [t for t in bag.chosen(options.replay_topics) if _can_publish(t, options)]
         packets = sorted(
             (packet.log_time_ns, topic.name, packet.data)
             for topic in chosen
@@ -167,73 +212,164 @@ def _replay(options: argparse.Namespace) -> int:
     return 0
 
 
-def _replay_node(options: argparse.Namespace) -> int:
+def _can_publish(topic: RecordedTopic, options: argparse.Namespace) -> bool:
+    """Whether ROS here has the type of a topic; one that was named by itself is required.
+
+    Raises:
+        EnvironmentFault: if it is required.
+    """
+    try:
+        why = topic.misfit
+    except EnvironmentFault as fault:
+        why = str(fault)
+    if why and topic.name in options.replay_topics:
+        raise EnvironmentFault(f"replay: {topic.name} cannot be published: {why}")
+    if why:
+        print(f"neuros: {topic.name} is not published: {why}", file=sys.stderr)
+    return not why
+
+
+def _replay_bag(options: argparse.Namespace) -> int:
+    """Give topics of a bag to a node of a project."""
+    from neuros.bag import open_bag
+    from neuros.replay.bag_into_node import replay_into, rules_of
+    from neuros.testing import PluginHarness
+
+    if len(options.nodes) != 1:
+        raise UsageError("replay: --remap needs the node that gets the packets: one --node NAME")
+    (name,) = options.nodes
+    if options.pdb or options.debugpy is not None or options.replay_topics:
+        raise UsageError("replay: --remap takes neither --pdb, --debugpy nor --topic")
+    rules = rules_of(options.remap)
+    project = Path(options.project)
+    if not project.exists():
+        raise UsageError(f"replay: there is no project {project}: name it with --project")
+    folder = None if options.output is None else _folder(options.output)
+    with open_bag(options.run) as bag, contextlib.ExitStack() as stack:
+        try:
+            harness = PluginHarness.from_project(project, name, run_folder=folder)
+        except KeyError:
+            raise UsageError(f"replay: {project} has no node '{name}'") from None
+        stack.enter_context(harness)
+        kept = None if folder is None else folder / "bag"
+        done = replay_into(harness, bag, rules, keep=kept, log=print)
+    for topic, count in done.arrived.items():
+        waiting = done.waiting.get(topic, 0)
+        rest = f", {waiting} of which waited at the end" if waiting else ""
+        print(f"{topic} -> {rules[topic]}: {counted(count, 'packet')}{rest}")
+    starts = ", ".join(f"{hook} {count}" for hook, count in done.executions.items())
+    print(f"starts of hooks: {starts or 'none'}")
+    for output, count in done.sent.items():
+        print(f"{name}.{output}: {counted(count, 'packet')}")
+    if done.ended is not None:
+        print(f"'{name}' ended the project: {done.ended}")
+    if kept is not None:
+        print(kept)
+    return 0
+
+
+def _replay_node(options: argparse.Namespace, run: PastRun) -> int:
     """Become the process in which the node is replayed; returns only if that is interrupted.
 
     The node runs in this very process (``exec``), which becomes one like those of a run: with the
     Python, the environment and the script of the node, and with the terminal, for debuggers.
 
     Raises:
-        UsageError: if the run, the node or the recording is not there.
+        UsageError: if the node or the recording is not there.
         EnvironmentFault: if the node's Python cannot be made.
     """
-    if options.replay_topics:
-        raise UsageError("replay: --node runs a node, --topic publishes: choose one of them")
-    from neuros.cli.environments import require_messages
-    from neuros.distribution import WORKSPACE
-    from neuros.messages.workspace import message_cache
-    from neuros.node.keeping import RESTORED
-    from neuros.replay.from_container import as_on_this_machine
-    from neuros.replay.recorded_node import RecordedNode, recorded_node
+    from neuros.replay.node_replay import replay_of
 
-    run, file = recorded_node(Path(options.run).absolute(), options.node)
-    file = as_on_this_machine(run, file, WORKSPACE, message_cache(os.environ))
-    require_messages(file)
-    if not (file.node.module or file.node.plugin.is_file()):
-        raise UsageError(f"replay: the plugin of '{options.node}' is gone: {file.node.plugin}")
-    RecordedNode(run, file)
-    python, ended = _python(run, file)
+    replay = replay_of(run, options.nodes[0])
+    python, ended = replay.make_python()
     if ended:
         return ended
-    folder = _folder(options.output)
-    if file.restored:
-        shutil.copytree(run.folder / options.node / RESTORED, folder / options.node / RESTORED)
-    file = replace(file, folders=replace(file.folders, run=folder))
-    command = python_command("neuros.cli", "replayed", "--run", str(run.folder), python=python)
-    command += ["--pdb"] if options.pdb else []
-    command += ["--debugpy", str(options.debugpy)] if options.debugpy is not None else []
-    command += [] if options.output else ["--remove"]
-    _become(command, file)
+    arguments = ["--pdb"] if options.pdb else []
+    arguments += ["--debugpy", str(options.debugpy)] if options.debugpy is not None else []
+    arguments += [] if options.output else ["--remove"]
+    replay.start(python, _folder(options.output), arguments).become()
     return 0
 
 
-def _python(run: PastRun, file: NodeFile) -> tuple[Path, int]:
-    """The Python of the node, made if necessary, and the exit code of a signal meanwhile, else 0.
+def _replay_nodes(options: argparse.Namespace, run: PastRun) -> int:
+    """Replay nodes in processes of their own, and show a table.
 
     Raises:
-        EnvironmentFault: if it cannot be made.
+        UsageError, EnvironmentFault: if some of them cannot be replayed.
     """
-    from neuros.backends.pythons import Pythons
-    from neuros.cli.environments import make_shown_environments
-    from neuros.registry import ran_in_one_process
-    from neuros.replay.from_container import not_here, ran_in_container
+    from neuros.backends.node_command import usable_cores
+    from neuros.cli.environments import signals_interrupt
+    from neuros.replay.whole_run import Replays, replays_of
 
-    own = [] if ran_in_one_process(run.record) else [file.node]
+    replays = replays_of(run, options.nodes or [*run.nodes])
+    pythons = []
+    for replay in replays:
+        python, ended = replay.make_python()
+        if ended:
+            return ended
+        pythons.append(python)
+    folder = _folder(options.output)
+    jobs = options.jobs or min(len(usable_cores()), len(replays))
+    count = iter(range(1, len(replays) + 1))
+    signals: list[int] = []
+
+    def tell(verdict: NodeVerdict) -> None:
+        of = f"({next(count)} of {len(replays)})"
+        print(f"neuros: replayed {verdict.node} {of}: {verdict.verdict}", file=sys.stderr)
+
     try:
-        pythons = Pythons.choose(own, file.folders.project, dict(os.environ))
-        ended = make_shown_environments(pythons, [])
-    except EnvironmentFault as fault:
-        raise not_here(run, file.node.name, fault) if ran_in_container(run) else fault from fault
-    return pythons.paths.get(file.node.name, Path(sys.executable)), ended
+        with signals_interrupt(signals):
+            verdicts = Replays(folder, jobs).run(zip(replays, pythons, strict=True), tell)
+    except KeyboardInterrupt:
+        return EXIT_LEFT
+    finally:
+        if options.output is None:
+            shutil.rmtree(folder, ignore_errors=True)
+    _show(verdicts, run, options)
+    found = {verdict.verdict for verdict in verdicts}
+    return next((code for verdict, code in _EXIT_CODES.items() if verdict in found), 0)
+
+
+def _show(verdicts: Sequence[NodeVerdict], run: PastRun, options: argparse.Namespace) -> None:
+    from neuros.replay.node_replay import IDENTICAL
+    from neuros.replay.recorded_node import is_cut_off
+
+    notes = [f"{each.node}: {note}" for each in verdicts for note in each.notes]
+    if is_cut_off(run):
+        notes.insert(0, "the launcher of the run was killed: it is replayed as far as it was kept")
+    if options.format == JSON:
+        print_json({"nodes": verdicts, "notes": notes})
+        return
+    from tabulate import tabulate
+
+    for note in notes:
+        print(f"note: {note}")
+    rows = [
+        [
+            each.node,
+            each.hooks,
+            each.packets,
+            each.verdict + ("" if each.is_whole else ", as far as recorded"),
+            each.difference,
+        ]
+        for each in verdicts
+    ]
+    header = ["node", "hooks executed", "packets compared", "verdict", "first difference"]
+    print(tabulate(rows, header, disable_numparse=True, colalign=("left", "right", "right")))
+    packets = counted(sum(each.packets for each in verdicts), "packet")
+    hooks = counted(sum(each.hooks for each in verdicts), "start")
+    others = [f"{each.node} {each.verdict}" for each in verdicts if each.verdict != IDENTICAL]
+    result = ", ".join(others) or f"identical: {counted(len(verdicts), 'node')}"
+    print(f"\n{result}; {packets}; {hooks} of hooks")
 
 
 def _replayed(options: argparse.Namespace) -> int:
-    """The process that :func:`_replay_node` becomes."""
-    from neuros.api.run_record import open_run
+    """The process that replays one node."""
     from neuros.project.split import node_file_from_json
     from neuros.recording.provenance import python_versions
     from neuros.replay.from_container import note_on_versions, ran_in_container
-    from neuros.replay.recorded_node import RecordedNode
+    from neuros.replay.node_replay import FAILED, NodeVerdict
+    from neuros.replay.recorded_node import RecordedNode, recorded_run
     from neuros.replay.replayed_node import ReplayedNode, debugpy_on, files_changed_since
 
     faulthandler.enable()
@@ -242,16 +378,43 @@ def _replayed(options: argparse.Namespace) -> int:
     if options.remove:
         atexit.register(shutil.rmtree, file.folders.run, ignore_errors=True)
     run_folder = Path(options.run)
-    run = open_run(run_folder)
-    for path in files_changed_since(run_folder, file):
-        print(f"note: {path} was changed after the run had begun")
+    run = recorded_run(run_folder)
+    notes = [
+        f"{path} was changed after the run had begun"
+        for path in files_changed_since(run_folder, file)
+    ]
     if ran_in_container(run) and (note := note_on_versions(run, file.node.name, python_versions())):
+        notes.append(note)
+    for note in () if options.verdict else notes:
         print(f"note: {note}")
     node = ReplayedNode(file, RecordedNode(run, file))
     with debugpy_on(options.debugpy):
         sys.stdout.flush()
         is_left = _run(node, use_pdb=options.pdb)
-    return _verdict(node, run, file.node.name, is_left=is_left)
+    if is_left:
+        compared = _compared(node.comparison.packets, node.comparison.connections)
+        starts = counted(node.starts, "start")
+        print(f"left after {starts} of hooks; identical so far: {compared}")
+        return EXIT_LEFT
+    try:
+        verdict = _verdict(node, run, file.node.name)
+    except EnvironmentFault as fault:
+        if options.verdict is None:
+            raise
+        text = str(fault).removeprefix("replay: ")
+        verdict = NodeVerdict(file.node.name, FAILED, difference=text)
+    if options.verdict is not None:
+        replace(verdict, notes=(*notes, *verdict.notes)).save(options.verdict)
+    else:
+        for note in verdict.notes:
+            print(f"note: {note}")
+        text = verdict.difference
+        if not text:
+            compared = _compared(verdict.packets, verdict.connections)
+            what = compared if verdict.connections else "it sends nothing"
+            text = f"{what}; {counted(verdict.hooks, 'start')} of hooks"
+        print(f"{verdict.verdict}: {text}")
+    return _EXIT_CODES[verdict.verdict]
 
 
 def _run(node: ReplayedNode, *, use_pdb: bool) -> bool:
@@ -279,17 +442,17 @@ def _run(node: ReplayedNode, *, use_pdb: bool) -> bool:
     return False
 
 
-def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> int:
-    from neuros.replay.from_container import missing_module, not_here, ran_in_container
+def _verdict(node: ReplayedNode, run: PastRun, name: str) -> NodeVerdict:
+    """The verdict at the end of a replay.
 
-    compared = node.comparison
-    packets = (
-        f"{counted(compared.packets, 'packet')} on {counted(compared.connections, 'connection')}"
-    )
-    if is_left:
-        print(f"left after {counted(node.starts, 'start')} of hooks; identical so far: {packets}")
-        return EXIT_LEFT
-    if node.failure is not None and node.difference is None:
+    Raises:
+        EnvironmentFault: if a node that ran in a container lacks a module here.
+    """
+    from neuros.replay.from_container import missing_module, not_here, ran_in_container
+    from neuros.replay.node_replay import DIFFERENT, IDENTICAL, UNKNOWN, NodeVerdict
+
+    difference = node.difference
+    if node.failure is not None and difference is None:
         # The run ended with a failure of this node, at this very start of a hook.
         record = run.record
         is_named = bool(record["exit_code"]) and name in record["reason"]
@@ -297,20 +460,28 @@ def _verdict(node: ReplayedNode, run: PastRun, name: str, *, is_left: bool) -> i
             if ran_in_container(run) and (lack := missing_module(node.failure)):
                 raise not_here(run, name, lack)
             first = str(node.failure).partition("\n")[0]
-            print(f"different: it failed, but did not in the run: {first}")
-            return EXIT_DIFFERENT
-        node.notes.append(f"it failed, as in the run: {node.failure}")
-    for note in node.notes:
-        print(f"note: {note}")
-    if node.difference is not None:
-        print(f"different: {node.difference}")
-        return EXIT_DIFFERENT
-    if not compared.packets and node.has_outputs and (node.notes or not compared.connections):
-        print("unknown: its packets were not recorded")
-        return EXIT_UNKNOWN
-    what = packets if compared.connections else "it sends nothing"
-    print(f"identical: {what}; {counted(node.starts, 'start')} of hooks")
-    return EXIT_IDENTICAL
+            difference = f"it failed, but did not in the run: {first}"
+        else:
+            node.notes.append(f"it failed, as in the run: {node.failure}")
+    compared = node.comparison
+    verdict = IDENTICAL if difference is None else DIFFERENT
+    is_lacking = node.has_outputs and (node.notes or not compared.connections)
+    if verdict == IDENTICAL and not compared.packets and is_lacking:
+        verdict, difference = UNKNOWN, "its packets were not recorded"
+    return NodeVerdict(
+        name,
+        verdict,
+        node.starts,
+        compared.packets,
+        compared.connections,
+        node.is_whole,
+        difference or "",
+        tuple(node.notes),
+    )
+
+
+def _compared(packets: int, connections: int) -> str:
+    return f"{counted(packets, 'packet')} on {counted(connections, 'connection')}"
 
 
 def _folder(output: str | None) -> Path:
@@ -322,31 +493,3 @@ def _folder(output: str | None) -> Path:
     from neuros.api.run_folder import make_run_folder
 
     return make_run_folder(output, "replay")
-
-
-def _become(command: Sequence[str], file: NodeFile) -> None:
-    from neuros.backends.node_command import (
-        node_environment,
-        process_environment,
-        start_arguments,
-        start_environment,
-        with_messages,
-    )
-    from neuros.project.split import node_file_text
-
-    own = file.folders.run / file.node.name
-    own.mkdir(exist_ok=True)  # what was restored to the node is there
-    (own / "node.json").write_text(node_file_text(file), "utf-8")
-    added = {
-        **node_environment(file),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF",  # it has no neighbours
-        "ROS_LOG_DIR": str(file.folders.run),
-    }
-    environment = start_environment(
-        command, [file], with_messages(process_environment(os.environ, added), file.messages)
-    )
-    arguments = start_arguments(command, [file])
-    for stream in (sys.stdout, sys.stderr):
-        stream.flush()
-    os.chdir(file.folders.run)
-    os.execve(shutil.which(arguments[0]) or arguments[0], arguments, environment)

@@ -1,9 +1,11 @@
 """The event log of an engine, an array of integers, and its replay.
 
 The decisions of an engine follow from its events and, if hooks have a period, from the readings of
-its clock. The log holds both in their order, and each start of a hook, for a check of the replay. A
+its clock; what hooks compute may follow from readings of their own (:meth:`Engine.reading`). The
+log holds all of them in their order, and each start of a hook, for a check of the replay. A
 negative entry is an event: its complement holds the kind in 5 bits, a place in 20 and a position in
-38. Other entries are readings of the clock in ns. An entry costs some 0.1 us.
+38. Other entries are readings of the clock in ns, or that of a hook, after ``READING``. An entry
+costs some 0.1 us.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from enum import IntEnum
+from itertools import islice
 from typing import Any, NamedTuple, Protocol
 
 from neuros.engine.engine import Effects, Engine
@@ -45,10 +48,12 @@ class EventKind(IntEnum):
     DEFERRED = 15  # the pass ended before its time for arrivals; position: hooks started in it
     LAST_ROUND = 16  # before DRAIN; place: of a hook that starts at most once more
     ACTIVATE = 17
+    READING = 18  # by a hook; the next entry is the value
+    CALLBACK = 19  # of a ROS entity of the plugin, which no replay can call
 
 
 class Event(NamedTuple):
-    """An event, and the readings of the clock up to the next event.
+    """An event, and the readings of the clock, and of hooks, up to the next event.
 
     ``limit``: starts of hooks after which arrivals ended the pass; ``None``: nothing ended it.
     """
@@ -57,6 +62,7 @@ class Event(NamedTuple):
     place: int
     position: int
     readings: list[int]
+    hook_readings: list[int]
     limit: int | None = None
 
 
@@ -156,6 +162,14 @@ class LoggedEngine(Engine):
         self._record(_entry(EventKind.STEP, int(is_driven), count))
         super().step(count, is_driven=is_driven)
 
+    def reading(self, value: int) -> int:
+        self._record(_READING)
+        self._record(value)
+        return value
+
+    def note_callback(self) -> None:
+        self._record(_CALLBACK)
+
     def stop_hooks(self) -> None:
         super().stop_hooks()
         self._record(_entry(EventKind.STOP))
@@ -175,17 +189,20 @@ class LoggedEngine(Engine):
 
 def events_of(event_log: Iterable[int]) -> Iterator[Event]:
     """The events of a log; the first, ``BEGIN``, has the readings before all events."""
-    event = Event(EventKind.BEGIN, 0, 0, [])
-    for number in event_log:
+    event = Event(EventKind.BEGIN, 0, 0, [], [])
+    numbers = iter(event_log)
+    for number in numbers:
         if number >= 0:
             event.readings.append(number)
             continue
         kind, place, position = _parts(number)
         if kind is EventKind.DEFERRED:
             event = event._replace(limit=position)
-        elif kind is not EventKind.HOOK:
+        elif kind is EventKind.READING:
+            event.hook_readings.extend(islice(numbers, 1))  # none where the log was cut off
+        elif kind not in (EventKind.HOOK, EventKind.CALLBACK):
             yield event
-            event = Event(kind, place, position, [])
+            event = Event(kind, place, position, [], [])
     yield event
 
 
@@ -199,6 +216,11 @@ def starts_of(event_log: Iterable[int]) -> Iterator[int]:
 def is_whole(event_log: Iterable[int]) -> bool:
     """Whether a log reaches the end of the run."""
     return _entry(EventKind.STOP) in event_log
+
+
+def callbacks_in(event_log: array[int]) -> int:
+    """How many callbacks of ROS entities of the plugin ran."""
+    return event_log.count(_CALLBACK)
 
 
 def is_understood(event_log: Iterable[int]) -> bool:
@@ -222,6 +244,7 @@ def _mask(bits: int) -> int:
 
 
 _TIMER, _LOOP_BACK, _OFFER = map(_entry, (EventKind.TIMER, EventKind.LOOP_BACK, EventKind.OFFER))
+_READING, _CALLBACK = map(_entry, (EventKind.READING, EventKind.CALLBACK))
 
 
 # ---------------------------------------------------------------------- replay
@@ -283,6 +306,7 @@ class Script:
         self._starts = starts_of(event_log)
         self._next = next(self._starts, _NO_START)
         self._readings: Iterator[int] = iter(next(self._events).readings)
+        self._hook_readings: Iterator[int] = iter(())
         self._now_ns = 0
         self._limit: int | None = None
         self._in_event = 0
@@ -294,6 +318,10 @@ class Script:
         """The next reading of the clock in the log, or else the last one."""
         self._now_ns = next(self._readings, self._now_ns)
         return self._now_ns
+
+    def reading(self, value: int) -> int:
+        """The next reading of a hook in the log; ``value`` for one that a changed plugin adds."""
+        return next(self._hook_readings, value)
 
     def may_start(self) -> bool:
         """Whether a ready hook starts now, and not after further arrivals."""
@@ -307,6 +335,7 @@ class Script:
         """The events, in their order."""
         for event in self._events:
             self._readings = iter(event.readings)
+            self._hook_readings = iter(event.hook_readings)
             self._limit, self._in_event = event.limit, 0
             yield event
 
@@ -349,6 +378,7 @@ class ReplayedEngine(Engine):
     ) -> None:
         super().__init__(node, connections, specs, effects, script.clock, packet_types)
         self._has_taken_in = script.may_start
+        self.reading = script.reading  # type: ignore[method-assign]
         self._script = script
         self._places = {hook: place for place, hook in enumerate(self.all_hooks)}
         self._names = {place: hook.name for hook, place in self._places.items()}

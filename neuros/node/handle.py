@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from neuros.engine.engine import Engine
 from neuros.errors import ModelError, NodeError
@@ -17,11 +17,12 @@ from neuros.node.failures import Failures, as_node_error
 from neuros.node.keeping import Keeping
 from neuros.node.simulated_time import SimulatedTime
 from neuros.node.virtual import VirtualTime, refuse_thread
-from neuros.ports import Logger, NodeEvents, Packets, WorldLook
+from neuros.ports import Advance, Logger, NodeEvents, Packets, WorldLook
 from neuros.project.model import Node, NodeFile
 from neuros.project.suggest import did_you_mean
 
 _POLL_S = 0.05
+Check: TypeAlias = "Callable[[Mapping[str, str]], object]"
 _EMPTY = "std_msgs/msg/Empty"
 
 
@@ -32,15 +33,18 @@ class PluginServices:
         ask_for_end: called with ``reason`` and ``drain_s``, the seconds for draining.
         tell_progress: called with what a plugin says of its progress.
         show_world: called with what shows the simulated world of the node.
+        drive: called with what advances a world that runs by itself; returns whether the node does
+            that, so that no thread has to.
 
     Attributes:
         closers: called once when the node ends, last added first.
+        changes: called when environment or parameters have changed, and before, as a check.
         engine: the node's, ``None`` until its plugin is loaded.
         is_active: set at time 0 of the run, when every node of the project is ready.
         is_ending: whether no further hook starts.
         results: what the plugin has noted.
             keeping: what it keeps.
-        make_packet: a new packet, for the type of a port.
+        maker_of: the function that makes packets of the type of a port.
             time: that of the node, if it has one.
         virtual_time: that of the run; ``None``: the run is in real time.
         waiting_threads: those that wait until packets that they have offered are sent.
@@ -55,24 +59,28 @@ class PluginServices:
         ask_for_end: Callable[..., object],
         tell_progress: Callable[[str], object],
         show_world: Callable[[WorldLook], None],
+        drive: Callable[[Advance], bool],
         results: Results,
         keeping: Keeping,
     ) -> None:
         self.engine: Engine | None = None
+        self._thread_id = threading.get_ident()
         self.is_ending = False
         self.is_active = threading.Event()
         self.virtual_time: VirtualTime | None = None
         self.waiting_threads: set[threading.Thread] = set()
-        self.make_packet = packets.make
+        self.maker_of = packets.maker
         self._loop = loop
         self.time = time
         self._failures = failures
         self._ask_for_end = ask_for_end
         self.tell_progress = tell_progress
         self.show_world = show_world
+        self.drive = drive
         self.results = results
         self.keeping = keeping
         self.closers: list[Callable[[], None]] = []
+        self.changes: list[tuple[Callable[[], object], Check]] = []
 
     def stop(self) -> None:
         """Start no further hook. Any thread."""
@@ -94,11 +102,20 @@ class PluginServices:
             except BaseException as error:  # the others must still be closed
                 self._failures.report(as_node_error(error, "failed while it was closed: "))
 
+    def reading(self, value: int) -> int:
+        """What a hook reads of something that goes on by itself; any other thread just reads it."""
+        engine = self.engine
+        is_hook = engine is not None and engine.executing is not None
+        if not is_hook or threading.get_ident() != self._thread_id:
+            return value
+        assert engine is not None
+        return engine.reading(value)
+
     def note_time(self) -> bool:
         """Simulated time has gone on in another thread; returns whether it is not over."""
         is_over = self.time.is_over
         if is_over:
-            self._loop.post_from_thread(lambda: self._failures.guard(self.time.look))
+            self._loop.post_from_thread(lambda: self._failures.guard(self.time.update))
         return not is_over
 
     def fail_from_thread(self, error: BaseException) -> None:
@@ -121,7 +138,7 @@ class PluginServices:
             self.waiting_threads.add(thread)
             withdrawals.append(self.engine.offer(packets, accept))
             if self.time.is_watched:
-                self.time.look()
+                self.time.update()
 
         def withdraw(done: Callable[[], None]) -> None:
             def event() -> None:
@@ -144,6 +161,7 @@ class NodeHandle:
         self._ros_node = ros_node
         self._services = services
         self._types = {port.name: port.type for port in file.node.outputs}
+        self._makers: dict[str, Callable[[], Any]] = {}
         self._user_data: Any = None
 
     @property
@@ -193,7 +211,7 @@ class NodeHandle:
 
         It is simulated where the node has a simulator or a clock, and 0 before that is known.
         """
-        return self._services.time.stamp()
+        return self._services.time.stamp(self.reading)
 
     def make_packet(self, output: str | None = None) -> Any:
         """A new message for an output, with default values, or an array of zeros.
@@ -206,15 +224,16 @@ class NodeHandle:
             NodeError: if the node has no such output, or several could be meant.
         """
         if output is None:
-            return self._services.make_packet(self._only_type())
-        try:
-            type_name = self._types[output]
-        except KeyError:
-            known = ", ".join(self._types) or "none"
-            raise NodeError(
-                f"make_packet: node '{self.name}' has no output '{output}' (it has {known})"
-            ) from None
-        return self._services.make_packet(type_name)
+            return self._services.maker_of(self._only_type())()
+        make = self._makers.get(output)
+        if make is None:
+            if output not in self._types:
+                known = ", ".join(self._types) or "none"
+                raise NodeError(
+                    f"make_packet: node '{self.name}' has no output '{output}' (it has {known})"
+                )
+            make = self._makers[output] = self._services.maker_of(self._types[output])
+        return make()
 
     def get_ros_node(self) -> Any:
         """The real ``rclpy.node.Node``; what is created on it is served between hooks."""
@@ -367,6 +386,25 @@ class NodeHandle:
         """Tell, from any thread, that it has gone on; returns whether it is to go on further."""
         return self._services.note_time()
 
+    def reading(self, value: int) -> int:
+        """A reading, from 0, of something that goes on by itself, such as a clock of a device.
+
+        A hook that computes with what this returns does the same in a replay: a recorded run keeps
+        the value, and a replay returns that one. Elsewhere than in a hook, it is just the value.
+        """
+        return self._services.reading(value)
+
+    def drive(self, advance: Advance) -> bool:
+        """Have a world that runs by itself advanced without a thread of its own.
+
+        Args:
+            advance: goes on to the next packets that are due, and returns them by output.
+
+        Returns:
+            Whether the node does that, as in a replay; else the simulator needs its thread.
+        """
+        return self._services.drive(advance)
+
     def show_world(self, look: WorldLook) -> None:
         """Let observers look at a simulated world, as the dashboard does."""
         self._services.show_world(look)
@@ -379,6 +417,17 @@ class NodeHandle:
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
         self._services.closers.append(callback)
+
+    def on_change(self, callback: Callable[[], object], check: Check = lambda _: None) -> None:
+        """Call ``callback`` when a fork of the run has changed environment or parameters.
+
+        That is between two hooks; by then, ``os.environ`` and the parameters have the new values.
+
+        Args:
+            check: called with the variables that will change, long before; what it raises ends the
+                fork.
+        """
+        self._services.changes.append((callback, check))
 
     def fail(self, error: BaseException) -> None:
         """End the node as failed, from any thread: for errors that no hook can raise."""

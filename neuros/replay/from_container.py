@@ -62,7 +62,9 @@ def note_on_versions(run: PastRun, name: str, here: Mapping[str, Any]) -> str:
     Args:
         here: as from :func:`neuros.recording.provenance.python_versions`.
     """
-    versions = run.record["versions"]
+    versions = run.record.get("versions")
+    if versions is None:  # the launcher was killed
+        return ""
     there = versions["nodes"].get(name, versions)  # not recorded if they are those of the launcher
     had = {"Python": there["python"], **there["packages"]}
     has = {"Python": here["python"], **here["packages"]}

@@ -23,13 +23,12 @@ from neuros.engine.event_log import (
     ReplayOver,
     ReplayParted,
     Script,
-    is_whole,
 )
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.hooks import HookSpec
 from neuros.node.context import ContextSwitch
 from neuros.node.node import NodeRuntime
-from neuros.ports import Inbox, Way
+from neuros.ports import Advance, Inbox, Way
 from neuros.project.model import Connection, NodeFile
 from neuros.replay.recorded_node import RecordedNode
 from neuros.runtime.local import LocalLoop, LocalMiddleware, NoTopics
@@ -183,15 +182,19 @@ class ReplayedNode:
         self._script = Script(recorded.event_log)
         self._loop = _Loop(self._script)
         self._middleware = _Alone(self._loop, None, on_failure=lambda _: None)
-        lacking = recorded.lacking()
-        self.comparison = Comparison(recorded.sent(), recorded.message, lacking)
+        lacking, sent = recorded.lacking(), recorded.sent()
+        topics = {name for topics in sent.values() for name, _, _ in topics}
+        may_lack = lacking if recorded.is_whole else topics
+        self.comparison = Comparison(sent, recorded.message, may_lack)
         self.failure: NeurosError | None = None
         self.notes = [
             f"the bag has {there} of {sent} packets on {name}: the others are not compared"
             for name, (there, sent) in lacking.items()
         ]
+        self.notes += filter(None, [recorded.callbacks])
         self.difference: str | None = None
-        self._is_cut_off = False
+        self._is_cut_off = False  # the replay ends before the event log does
+        self._worlds: list[Advance] = []  # that run by themselves
         self._runtime = NodeRuntime(
             file,
             self._middleware,
@@ -202,6 +205,7 @@ class ReplayedNode:
             log_file=None,
             duration_sim_s=None,
             make_engine=partial(ReplayedEngine, self._script),
+            drive=self._drive,
         )
         self._types = {
             str(c): file.node.input(c.destination_input).type
@@ -217,6 +221,11 @@ class ReplayedNode:
     def expects_start(self) -> bool:
         """Whether more hooks started in the run."""
         return self._script.expects_start
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether what was recorded reaches the end of the node."""
+        return self._recorded.is_whole and not self._is_cut_off
 
     @property
     def has_outputs(self) -> bool:
@@ -256,7 +265,10 @@ class ReplayedNode:
         return packet
 
     def offer(self) -> None:
-        """Wait for packets from a thread of the plugin, and give them to the engine."""
+        """Give the engine packets of a world that runs by itself, or of a thread of the plugin."""
+        if self._worlds:
+            self._offer_of_world()
+            return
         self._engine.has_offer = False
         while not self._engine.has_offer:
             is_alone = threading.active_count() == 1
@@ -268,6 +280,25 @@ class ReplayedNode:
                     " replay"
                 )
             self._loop.wait(_POLL_S)
+
+    def _drive(self, advance: Advance) -> bool:
+        self._worlds.append(advance)
+        return True
+
+    def _offer_of_world(self) -> None:
+        if len(self._worlds) > 1:
+            raise ReplayParted(
+                f"{len(self._worlds)} worlds of the node run by themselves, and the run does not"
+                " tell which of them sent packets when"
+            )
+        packets: Mapping[str, Any] = {}
+        try:
+            while not packets:
+                packets = self._worlds[0]()
+        except NeurosError as error:
+            self._fail(self._file.node.name, error)
+        else:
+            self._engine.offer(packets, lambda: None)
 
     @property
     def _engine(self) -> ReplayedEngine:
@@ -293,7 +324,7 @@ class ReplayedNode:
 
     def _end(self) -> None:
         """Judge the replay at the end of the event log."""
-        if not is_whole(self._recorded.event_log):
+        if not self._recorded.is_whole:
             self.notes.append(
                 f"the event log of the run ends after {self.starts} starts of hooks (the node was"
                 " killed, or ran for very long): what it sent later is not compared"

@@ -19,7 +19,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from neuros.ports import Inbox, Logger, NodeEvents, Transport, TransportKind, Voice
@@ -374,6 +374,14 @@ class LocalRosNode:
             self._parameters[name] = value
         return self.get_parameter(name)
 
+    def set_parameters(self, parameters: Sequence[Any]) -> Sequence[Any]:
+        """Set parameters that are declared, as in rclpy."""
+        if not self._real and all(each.name in self._parameters for each in parameters):
+            self._parameters |= {each.name: each.value for each in parameters}
+            return [SimpleNamespace(successful=True, reason="") for _ in parameters]
+        results: Sequence[Any] = self.__getattr__("set_parameters")(parameters)
+        return results
+
     def __getattr__(self, attribute: str) -> Any:
         if attribute.startswith("__"):  # copy and pickle look for such attributes
             raise AttributeError(attribute)
@@ -437,7 +445,7 @@ class LocalMiddleware:
         self._ros_nodes: dict[str, Any] = {}
         self._marks: dict[str, Callable[[RosProcess], None]] = {}
         self._transports: list[Transport] = []
-        self.loop: LocalLoop | RosLoop = loop or self._with_ros().loop
+        self.loop: LocalLoop | RosLoop = loop or self._with_ros().ros_loop
         self.packets = RosPackets()
         self.hub = MemoryHub(self.loop, self.packets.copier)
 
@@ -474,7 +482,7 @@ class LocalMiddleware:
         from neuros.transport.ros_graph import RosGraphBridge
 
         shown = file if self._exposes else replace(file, connections=())
-        return RosGraphBridge(shown, self._ros_node(file), self._with_ros().loop)
+        return RosGraphBridge(shown, self._ros_node(file), self._with_ros().ros_loop)
 
     def ros_node(self, file: NodeFile) -> Any:
         return self._ros_nodes[file.node.name]
@@ -549,7 +557,7 @@ class LocalMiddleware:
             os.environ.setdefault(RANGE_VARIABLE, "LOCALHOST")
             self._ros = RosProcess(self._files, self._on_failure, debug=self._debug)
             if self._local is not None:
-                self._local.serve(self._ros.loop)
+                self._local.serve(self._ros.ros_loop)
         return self._ros
 
 

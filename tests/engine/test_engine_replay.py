@@ -20,6 +20,7 @@ from neuros.engine.event_log import (
     ReplayOver,
     ReplayParted,
     Script,
+    callbacks_in,
     events_of,
     is_understood,
     is_whole,
@@ -59,6 +60,12 @@ def whole_bench(make_engine: Callable[..., Any], specs: list[HookSpec]) -> Bench
     )
 
 
+def read_twice_or_not(bench: Bench) -> list[int]:
+    """What every other hook reads of the clock."""
+    times = 2 * (len(bench.calls) % 2)
+    return [bench.engine.reading(bench.clock.now_ns + number) for number in range(times)]
+
+
 class Run:
     """A node, and neighbours that keep the rules but for when they do something."""
 
@@ -66,6 +73,7 @@ class Run:
         self.bench = whole_bench(LoggedEngine, specs)
         self.bench.during_call = self.on_call
         self.calls_until_arrival = 0
+        self.readings: list[int] = []
         self.arrived: dict[Connection | str, list[Any]] = {c: [] for c in INCOMING} | {"topic": []}
         engine = self.bench.engine
         for connection in (*OUTGOING, CONNECTIONS[3]):
@@ -116,7 +124,8 @@ class Run:
             self.calls_until_arrival = 1 + advance_ns % 3
 
     def on_call(self) -> None:
-        """Something arrives while one of the next hooks runs, so the pass ends after it."""
+        """The hook reads the clock; something may arrive meanwhile, so the pass ends after it."""
+        self.readings += read_twice_or_not(self.bench)
         if self.calls_until_arrival:
             self.calls_until_arrival -= 1
             self.bench.is_taken_in = self.calls_until_arrival > 0
@@ -131,6 +140,9 @@ class Again:
         self.bench = whole_bench(partial(ReplayedEngine, self.script), specs)
         self.bench.post = self.script.deliveries.append  # type: ignore[method-assign]
         self.bench.post_loop_back = self._post_loop_back  # type: ignore[method-assign]
+        self.bench.clock.now_ns = 0  # what hooks read is that of the log
+        self.bench.during_call = self.on_call
+        self.readings: list[int] = []
         engine: Any = self.bench.engine
         self.start, self.drain, self.stop = engine.start, engine.drain, engine.stop_hooks
         self.activate = engine.activate
@@ -138,6 +150,9 @@ class Again:
         self.on_packet, self.on_timer = engine.on_packet, engine.on_timer
         self.on_acknowledgement = engine.on_acknowledgement
         self.on_registered = engine.on_registered
+
+    def on_call(self) -> None:
+        self.readings += read_twice_or_not(self.bench)
 
     def _post_loop_back(self, event: Callable[[], None]) -> None:
         self.script.loop_back = event
@@ -179,6 +194,7 @@ def test_a_node_does_again_what_it_did(
     assert again.bench.log == run.bench.log
     assert again.bench.calls == run.bench.calls
     assert again.bench.sent == run.bench.sent
+    assert again.readings == run.readings
     assert not again.script.expects_start
     assert is_whole(event_log)
     assert len(list(starts_of(event_log))) == len(run.bench.calls)
@@ -251,6 +267,36 @@ def test_a_node_without_ticks_notes_no_time() -> None:
     bench.packet(str(INCOMING[0]))
     assert isinstance(bench.engine, LoggedEngine)
     assert not any(event.readings for event in events_of(bench.engine.event_log))
+
+
+def test_a_hook_that_reads_more_than_in_the_run_gets_what_is_there_now() -> None:
+    bench = Bench(function("f", "x"), connections=[INCOMING[0]], make_engine=LoggedEngine)
+    bench.during_call = lambda: bench.engine.reading(7)
+    bench.packet(str(INCOMING[0]))
+    assert isinstance(bench.engine, LoggedEngine)
+    script = Script(bench.engine.event_log)
+    values = [[script.reading(1), script.reading(2)] for _ in script.events()]
+    assert values[-1] == [7, 2]
+
+
+def test_a_reading_that_was_cut_off_is_none() -> None:
+    engine = LoggedEngine.__new__(LoggedEngine)
+    engine.event_log = array("q")
+    engine._record = engine.event_log.append
+    engine.reading(3)
+    assert [event.hook_readings for event in events_of(engine.event_log)] == [[3]]
+    assert [event.hook_readings for event in events_of(engine.event_log[:1])] == [[]]
+
+
+def test_callbacks_of_a_plugin_are_counted_and_are_no_events() -> None:
+    bench = Bench(function("f", "x"), connections=[INCOMING[0]], make_engine=LoggedEngine)
+    bench.engine.note_callback()
+    bench.packet(str(INCOMING[0]))
+    bench.engine.note_callback()
+    assert isinstance(bench.engine, LoggedEngine)
+    assert callbacks_in(bench.engine.event_log) == 2
+    kinds = [event.kind for event in events_of(bench.engine.event_log)]
+    assert EventKind.CALLBACK not in kinds
 
 
 def test_every_kind_of_entry_has_a_number_of_its_own() -> None:

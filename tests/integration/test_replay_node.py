@@ -120,7 +120,7 @@ def test_the_run_folder_stays_as_it_is(recorded: Recorded, tmp_path: Path) -> No
 def test_a_node_that_the_run_has_not(recorded: Recorded) -> None:
     done = replay(recorded.run, "nobody")
     assert done.returncode == 2
-    assert f"{recorded.run} has no node 'nobody'; it has counter, mixer" in done.stderr
+    assert f"{recorded.run} has no node 'nobody' (it has counter, mixer)" in done.stderr
 
 
 def test_a_plugin_that_is_gone(own: Recorded) -> None:

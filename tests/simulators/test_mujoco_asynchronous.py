@@ -65,6 +65,45 @@ def test_the_packets_are_those_of_the_synchronous_simulation(node):
         assert str(packets["imu"]) == str(reference.read("imu"))
 
 
+def test_where_the_node_drives_the_world_there_is_no_thread_and_the_packets_are_the_same(node):
+    reference = MuJoCo(SimulatedNode({"imu": imu("turn_imu"), "clock": CLOCK}), WORLD)
+    node.is_driving = True
+    sim = MuJoCo(node, WORLD)
+    sim.run_asynchronous(1.0)
+    assert sim.is_running
+    assert not any("simulation" in thread.name for thread in threading.enumerate())
+    found = []
+    while len(found) < 4:
+        if packets := node.advance():
+            found.append(packets)
+    for packets in found:
+        reference.step_to_next()
+        for name in ("imu", "clock"):
+            assert str(packets.get(name)) == str(reference.read(name))
+    sim.stop()
+    assert not sim.is_running
+
+
+def test_a_world_that_the_node_drives_goes_on_to_the_step_at_which_a_hook_saw_it(node):
+    """As in a replay: a command takes effect at the step of the run, and firings are not lost."""
+    seen = iter([3, 14, 14])
+    node.is_driving = True
+    sim, reference = MuJoCo(node, WORLD), MuJoCo(SimulatedNode({"imu": imu("turn_imu")}), WORLD)
+    sim.run_asynchronous(1.0)
+    node.reading = lambda steps: next(seen, steps)
+    sim.actuate("turn_speed", 2.0)
+    assert sim.sim_time == pytest.approx(14 * sim.timestep)
+    with sim.paused():
+        assert sim.data.time == pytest.approx(14 * sim.timestep)
+    reference.step_synchronous(3)
+    reference.actuate("turn_speed", 2.0)
+    for _ in range(2):
+        reference.step_to_next()
+        while not (packets := node.advance()):
+            pass
+        assert str(packets["imu"]) == str(reference.read("imu"))
+
+
 def test_it_stands_still_until_every_node_is_ready_and_then_begins_at_time_zero(node):
     node.is_active = False
     sim = MuJoCo(node, WORLD)

@@ -114,13 +114,19 @@ def write_project(folder: Path) -> Path:
 def replay(
     run: Path, name: str, *arguments: str, stdin: str = "", **environment: str
 ) -> subprocess.CompletedProcess[str]:
+    return replay_run(run, "--node", name, *arguments, stdin=stdin, **environment)
+
+
+def replay_run(
+    run: Path, *arguments: str, stdin: str = "", **environment: str
+) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "neuros.cli", "replay", str(run), "--node", name, *arguments],
+        [sys.executable, "-m", "neuros.cli", "replay", str(run), *arguments],
         input=stdin,
         capture_output=True,
         text=True,
         env={**os.environ, **environment},
-        timeout=60,
+        timeout=300,
         check=False,
     )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuros.errors import ModelError
-from neuros.ports import WorldLook
+from neuros.ports import Advance, WorldLook
 from neuros.project.model import Node, Port
 from neuros.transport.messages import make_packet
 
@@ -100,10 +100,13 @@ class SimulatedNode:
         self.is_blocked = False
         self.is_waiting = False
         self.closers: list[Callable[[], None]] = []
+        self.changes: list[Any] = []
         self.failures: list[BaseException] = []
         self.read_time_s: Callable[[], float] = lambda: -1.0
         self.ends_at_s = float("inf")
         self.look_at_world: WorldLook | None = None
+        self.is_driving = False
+        self.advance: Advance | None = None
 
     def make_packet(self, output: str) -> Any:
         return make_packet(self.description.output(output).type)
@@ -123,11 +126,26 @@ class SimulatedNode:
     def note_simulated_time(self) -> bool:
         return self.read_time_s() < self.ends_at_s
 
+    def reading(self, value: int) -> int:
+        return value
+
+    def drive(self, advance: Advance) -> bool:
+        if self.is_driving:
+            self.advance = advance
+        return self.is_driving
+
     def show_world(self, look: WorldLook) -> None:
         self.look_at_world = look
 
     def on_close(self, callback: Callable[[], None]) -> None:
         self.closers.append(callback)
+
+    def on_change(
+        self,
+        callback: Callable[[], object],
+        check: Callable[[Mapping[str, str]], object] = lambda _: None,
+    ) -> None:
+        self.changes.append((callback, check))
 
     def fail(self, error: BaseException) -> None:
         with self.changed:

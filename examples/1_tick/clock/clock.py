@@ -8,5 +8,5 @@ from neuros.hooks import neuros_tick
 @neuros_tick(seconds=1.0, outputs="time")
 def tick(node):
     packet = node.make_packet("time")
-    packet.data = datetime.now().strftime("%H:%M:%S")
+    packet.data = datetime.fromtimestamp(node.now().sec).strftime("%H:%M:%S")
     return packet

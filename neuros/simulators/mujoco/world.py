@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping, MutableSet, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +27,7 @@ from neuros.simulators.mujoco.sensor_base import Sensor
 from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
 from neuros.simulators.mujoco.timing import FiringSchedule, Timebase
 
+_PROLOGUE = re.compile(r"<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>]*>", re.DOTALL)
 _NUMBERS = (int, float, np.ndarray)  # types of fields of a model
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
@@ -124,12 +127,13 @@ class World(Declared):
         super().__init__(node.description, lambda: load_spec(node, model), problems, fine=fine)
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
+        self._no_warnings = bytes(self._warnings.nbytes)
         if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
             import_opengl()  # raises now, not at the first image
         self.steps = 0
         self._seen_warnings: set[int] = set()
         self._fields = ModelFields(self.where)
-        self._fields.apply(self.model, self.data)
+        self._fields.apply(self.model)
         mujoco.mj_resetData(self.model, self.data)
         forward(self.model, self.data)
 
@@ -157,30 +161,42 @@ class World(Declared):
         """Advance the physics; raises ``ModelError`` if it has become unstable."""
         mujoco.mj_step(self.model, self.data, nstep=count)
         self.steps += count
-        if self._warnings.any():
+        if self._warnings.tobytes() != self._no_warnings:  # any() takes ten times as long
             self._report_warnings(count)
 
-    def sense(self, outputs: Iterable[str]) -> dict[str, Packet]:
+    def sense(self, outputs: Sequence[str]) -> dict[str, Packet]:
         """The packets of these sensors for the present state."""
-        sensors = {output: self._bound.sensors[output] for output in outputs}
-        if any(sensor.needs_forward for sensor in sensors.values()):
-            forward(self.model, self.data)
+        sensors = self._bound.sensors
+        for output in outputs:
+            if sensors[output].needs_forward:
+                forward(self.model, self.data)
+                break
         time_ns = self.time.nanoseconds(self.steps)
         packets = {}
-        for output, sensor in sensors.items():
-            packet = packets[output] = self._node.make_packet(output)
-            if sensor.declared.array is None:
-                sensor.fill(packet, self.data, time_ns)
-            else:
+        for output in outputs:
+            sensor, packet = sensors[output], self._node.make_packet(output)
+            packets[output] = packet
+            if sensor.is_array:
                 sensor.fill_array(packet, self.data)
+            else:
+                sensor.fill(packet, self.data, time_ns)
         return packets
 
     def reset(self) -> None:
         """Back to time zero and the model's initial state; spawned entities stay."""
-        self._fields.apply(self.model, self.data)
+        self._fields.apply(self.model)
         mujoco.mj_resetData(self.model, self.data)
         forward(self.model, self.data)
         self.steps = 0
+
+    def check_fields(self, variables: Mapping[str, str]) -> None:
+        """Check the fields of the model that a fork will change. Raises ``ModelError``."""
+        self._fields.check(self.model, variables)
+
+    def change_fields(self) -> None:
+        """Change fields of the model as the environment has them now; the state stays."""
+        if self._fields.apply(self.model):
+            forward(self.model, self.data)
 
     def spawn(self, path: str, position: Sequence[float], name: str) -> None:
         """Attach the model of a file to the world; everything else keeps its state."""
@@ -311,19 +327,32 @@ class ModelFields:
         self._where = where
         self._before: dict[str, Any] = {}
 
-    def apply(self, model: Any, data: Any) -> None:
+    def check(self, model: Any, variables: Mapping[str, str]) -> None:
+        """Check that the fields in an environment can be changed. Raises ``ModelError``."""
+        if MODEL_FIELDS in variables:
+            ModelFields(self._where).apply(copy.copy(model), variables[MODEL_FIELDS])
+
+    def apply(self, model: Any, text: str | None = None) -> bool:
         """Give the fields of before their values back, then change those of now.
+
+        Args:
+            text: those of now, as JSON; ``None``: as the environment has them.
+
+        Returns:
+            Whether something may have changed.
 
         Raises:
             ModelError: if the model has no such field, or it has another shape.
         """
-        fields = json.loads(os.environ.get(MODEL_FIELDS) or "{}")
+        fields = json.loads((os.environ.get(MODEL_FIELDS) if text is None else text) or "{}")
         if not (fields or self._before):
-            return
+            return False
         for name, value in self._before.items():
             self._set(model, name, value)
         self._before = {name: self._set(model, name, value) for name, value in fields.items()}
-        mujoco.mj_setConst(model, data)  # what MuJoCo has derived from them
+        # What MuJoCo has derived from them; it computes that in the data that it is given.
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        return True
 
     def _set(self, model: Any, name: str, value: Any) -> Any:
         """Change a field; returns its value of before."""
@@ -436,11 +465,24 @@ def problems_of(description: Node, model: Path | str) -> list[tuple[str, str]]:
 
 def _from_text(description: Node, model: str) -> tuple[Any, str]:
     where = f"XML text in {description.plugin}"
+    if _is_urdf(model):
+        raise ModelError(f"{where}: this is URDF; write it to a file that ends in .urdf")
     return compiled(lambda: mujoco.MjSpec.from_string(model), where), where
+
+
+def _is_urdf(xml: str | Path) -> bool:
+    """Whether XML is URDF, which MuJoCo reads with defaults of its own in the place of URDF's."""
+    try:
+        text = xml if isinstance(xml, str) else xml.read_text("utf-8", "replace")
+    except OSError:
+        return False
+    return _PROLOGUE.sub("", text).lstrip("\ufeff \t\r\n").startswith("<robot")
 
 
 def _from_file(description: Node, path: Path, warn: Callable[[str], object]) -> Any:
     kind = path.suffix.lower()
+    if kind in (".xml", ".mjcf") and _is_urdf(path):
+        kind = ".urdf"
     if kind == ".xml":
         return compiled(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
     if kind == ".mjcf":  # MuJoCo's from_file knows .xml only

@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import os
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
@@ -21,6 +21,7 @@ import numpy as np
 
 from neuros.errors import ModelError
 from neuros.ports import NodeContext
+from neuros.project.model import MODEL_FIELDS
 from neuros.simulators.mujoco.readings import (
     AFTER_CONSTRAINT,
     STATE,
@@ -101,6 +102,7 @@ class MuJoCoWorlds:
         node.own_simulated_time(lambda: self.sim_time)
         node.show_world(self._view.observe)
         node.on_close(self.close)
+        node.on_change(self._change_fields, self._check_fields)
 
     @property
     def sim_time(self) -> float:
@@ -177,7 +179,7 @@ class MuJoCoWorlds:
             ModelError: for a mask of another number or type; for a field that the model lacks.
         """
         if mask is None:
-            self._fields.apply(self._model, self.data[0])
+            self._fields.apply(self._model)
             self._steps = 0
             self._generators = []
             if self._begin is not None or self._randomise is not None:
@@ -196,6 +198,18 @@ class MuJoCoWorlds:
 
     def _usual_threads(self) -> int:
         return min(len(os.sched_getaffinity(0)), self.copies // _COPIES_PER_THREAD)
+
+    def _check_fields(self, variables: Mapping[str, str]) -> None:
+        """Check the fields of the model that a fork will change. Raises ``ModelError``."""
+        self._fields.check(self._model, variables)
+        if MODEL_FIELDS in variables and self._randomise is not None:
+            raise ModelError(
+                f"{self._where}: each copy has a model of its own (randomise), so a fork cannot"
+                " change fields of all"
+            )
+
+    def _change_fields(self) -> None:
+        self._is_forward &= not self._fields.apply(self._model)
 
     def _control(self, ctrl: Any) -> None:
         if ctrl.shape != (self.copies, self._model.nu):

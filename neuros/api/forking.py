@@ -1,0 +1,147 @@
+"""Forks: a run, or a session, executed again up to a moment, which goes on with a change there."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from neuros.api.changes import changes_of
+from neuros.api.loading import override_texts
+from neuros.api.project import LOCAL, Project, StartOptions
+from neuros.api.run import Run
+from neuros.api.run_record import open_run
+from neuros.api.verify import RecordedPackets, first_difference
+from neuros.errors import RunError, UsageError
+from neuros.options import options_of
+from neuros.project.names import SESSION
+from neuros.project.repeatable import why_not_repeatable
+from neuros.project.split import project_to_json
+
+_INTERRUPTED = (130, 143)
+_FINE = 1e-9
+
+
+@dataclass(frozen=True)
+class Fork:
+    """A fork of a run that has ended.
+
+    Attributes:
+        run: the fork, a run of its own.
+        compared: packets up to the moment, one that has several receivers once for each.
+        difference: from the run up to there, in a sentence; empty: there is none.
+    """
+
+    run: Run
+    compared: int
+    difference: str
+
+
+def sim_seconds(text: str) -> float:
+    """The moment of ``--at 12.4sim``. Raises ``UsageError`` for anything else."""
+    match = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)sim", text.strip())
+    if match is None or float(match[1]) <= 0:
+        raise UsageError(f"--at {text}: give simulated seconds above 0, such as 12.4sim")
+    return float(match[1])
+
+
+def fork_run(
+    folder: Path,
+    at_sim_s: float,
+    settings: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> Fork:
+    """Execute a run again up to a simulated time, then go on with other settings to its end.
+
+    Args:
+        folder: of the run.
+        settings: by path, as for a reset of a session.
+        options: arguments of :meth:`Project.start` that take the place of those of the run.
+
+    Raises:
+        UsageError: with all reasons why the run cannot be forked, or the settings not be made.
+        ProjectError, EnvironmentFault: as for a start.
+        RunError: if it ends before the time, or fails when the settings are made.
+    """
+    past = open_run(folder)
+    project, chosen = _again(past.record, folder, at_sim_s, options)
+    texts = override_texts(chosen.set)
+    changes = changes_of(
+        project.described(chosen),
+        settings or {},
+        lambda more: project.described(replace(chosen, set=[*texts, *override_texts(more)])),
+    )
+    about = {
+        "run": str(folder),
+        "run_id": past.record.get("run_id"),
+        "at_sim_s": at_sim_s,
+        "set": dict(settings or {}),
+    }
+    with project.held(chosen, about) as session:
+        session.change(changes, only_checks=True)
+        if not session.run(duration_sim_s=at_sim_s):
+            ended = session.close()
+            raise RunError(f"the fork ended before {at_sim_s:g} s: {ended.reason}", 1)
+        counts = session.sent_counts()
+        session.change(changes)
+        run = session.finish()
+    recorded = RecordedPackets()
+    compared, difference = first_difference(past, run, counts, recorded)
+    return Fork(run, compared, difference)
+
+
+def _again(
+    record: Mapping[str, Any], folder: Path, at_sim_s: float, options: Mapping[str, Any]
+) -> tuple[Project, StartOptions]:
+    """The project of a run, and the options with which it began.
+
+    Raises:
+        UsageError: with all reasons why it cannot be forked.
+    """
+    told = json.dumps(record["expanded_project"])
+    file = Path(record["file"])
+    if record["backend"] == LOCAL or SESSION in told:
+        raise UsageError(f"{folder} is the run of a session: fork that in its program (fork())")
+    if record.get("fork", {}).get("set"):
+        raise UsageError(
+            f"{folder}: it is a fork with settings itself: fork the run that it began with,"
+            f" {record['fork']['run']}"
+        )
+    if not file.is_file():
+        raise UsageError(
+            f"{folder}: its project file is gone, or it was described in Python: {file}"
+        )
+    known = {each.name for each in options_of(StartOptions)}
+    given = {key: value for key, value in record["options"].items() if key in known}
+    restored = {
+        f"{node}.{name}": folder / node / "restored" / f"{name}.npz"
+        for node, figures in record["nodes"].items()
+        for name in figures.get("restored", {})
+    }
+    given |= {"restore": restored, "digests": given.get("packet_log") != "0"}
+    given |= {key: value for key, value in options.items() if value is not None}
+    chosen = StartOptions(**given)
+    project = Project.from_file(file)
+    described = project.described(chosen)
+    why = why_not_repeatable(described)
+    if json.dumps(project_to_json(described), sort_keys=True) != json.dumps(
+        record["expanded_project"], sort_keys=True
+    ):
+        why.insert(0, f"{file} was changed after the run: it describes another project now")
+    if chosen.nodes or record["options"].get("network"):
+        why.append("its nodes ran at several places: a fork runs all of them here")
+    owners = [node.name for node in described.nodes if node.owns_time]
+    if len(owners) != 1:
+        why.append(f"one node has to own simulated time, but {', '.join(owners) or 'none'} does")
+    elif at_sim_s > (record["sim_s"] or 0.0) - _FINE:
+        why.append(f"it ended at {record['sim_s'] or 0:g} s of simulated time: fork it before")
+    if chosen.duration is not None and chosen.end.sim_s is None:
+        why.append("it ends after a wall time: give --duration with simulated seconds (30sim)")
+    if record["exit_code"] in _INTERRUPTED and chosen.duration is None:
+        why.append(f"{record['reason']}: give --duration with simulated seconds (30sim)")
+    if why:
+        raise UsageError("\n".join([f"{folder} cannot be forked:", *(f"  {each}" for each in why)]))
+    return project, chosen

@@ -1,0 +1,70 @@
+"""``neuros fork``: a run executed again up to a moment, which goes on with a change there."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from neuros.project.suggest import counted
+
+EXIT_DIFFERENT = 6
+
+
+def add_fork(fork: argparse.ArgumentParser) -> None:
+    """Add the options of the command."""
+    fork.description = (
+        "Execute a run that has ended again up to a simulated time, then go on with other settings"
+        " to its end: a run of its own. Without settings, `neuros verify` finds both identical."
+    )
+    fork.epilog = (
+        "exit codes: those of `neuros launch`; 6 if the fork differs from the run before the time"
+    )
+    add = fork.add_argument
+    add("run", metavar="RUN", type=Path, help="the folder of a run")
+    add(
+        "--at",
+        required=True,
+        metavar="TIME",
+        help="the moment, in simulated seconds: 12.4sim; it is the end of the round in which the"
+        " simulated time is reached",
+    )
+    add(
+        "--set",
+        action="append",
+        default=[],
+        metavar="PATH=VALUE",
+        help="change a value there (repeatable): nodes.NODE.environment.VARIABLE,"
+        " nodes.NODE.parameters.NAME, or NODE.model.FIELD of a MuJoCo model",
+    )
+    add("-o", "--output", metavar="FOLDER", help="the run folder (default: as neuros launch)")
+    add("--backend", metavar="NAME", help="another back end than that of the run")
+    add(
+        "--duration",
+        metavar="SECONDS",
+        help="end after so many simulated seconds, from the start on: 30sim (default: as the run)",
+    )
+    fork.set_defaults(command=_fork)
+
+
+def _fork(options: argparse.Namespace) -> int:
+    from neuros.api.changes import settings_of
+    from neuros.api.forking import fork_run, sim_seconds
+    from neuros.cli.environments import signals_interrupt
+
+    at_sim_s = sim_seconds(options.at)
+    settings = settings_of(options.set)
+    with signals_interrupt([]):
+        forked = fork_run(
+            options.run.absolute(),
+            at_sim_s,
+            settings,
+            output=options.output,
+            backend=options.backend,
+            duration=options.duration,
+            show=True,
+        )
+    if forked.difference:
+        print(f"different before {at_sim_s:g} s: {forked.difference}")
+        return forked.run.exit_code or EXIT_DIFFERENT
+    print(f"identical up to {at_sim_s:g} s: {counted(forked.compared, 'packet')}")
+    return forked.run.exit_code

@@ -1,0 +1,70 @@
+"""Each example is recorded, and its whole run is replayed: every node sends the same again."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from launching import BACKENDS, EXAMPLES, launch
+
+WHISKEYE = "4_neurorobotics/whiskeye"
+SHORT = ("--duration", "3sim")
+FAST = ("--set", "nodes.elevator.environment.REAL_TIME_FACTOR=20")
+EVERY_TIME = [
+    ("1_tick/clock", "--duration", "2"),
+    ("2_synchronisation/tennis",),
+    ("3_physics_simulation/elevator/asynchronous.json", *FAST),
+]
+LONG = [
+    ("2_synchronisation/voting",),
+    ("3_physics_simulation/elevator",),
+    ("3_physics_simulation/elevator/no_discard_limit.json",),
+    (f"{WHISKEYE}/asynchronous.json",),
+    (f"{WHISKEYE}/custom_messages.json", *SHORT),
+    (f"{WHISKEYE}/no_discard_limit.json", *SHORT),
+    (f"{WHISKEYE}/project.json",),
+    (f"{WHISKEYE}/room.json", *SHORT),
+    (f"{WHISKEYE}/strict.json",),
+    (f"{WHISKEYE}/tick_20ms.json", *SHORT),
+    ("4_neurorobotics/light", "--duration", "5"),
+    ("6_outside/rover", "--duration", "2"),
+    ("7_learning/cartpole", *SHORT),
+]
+OWN_PYTHONS = ("5_containers/conflict", "--duration", "5")
+
+
+def replays(options: tuple[str, ...], backend: str, folder: Path) -> None:
+    """Run an example recorded, then replay it."""
+    project, *others = options
+    command = [str(EXAMPLES / project), "--backend", backend, "-r", *others]
+    run = launch(*command, cwd=folder, timeout_s=300.0)
+    assert run.exit_code == 0, run.output
+    done = subprocess.run(
+        [sys.executable, "-m", "neuros.cli", "replay", str(run.run_folder)],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"\nidentical: {len(run.record['nodes'])} node" in done.stdout
+    assert "as far as recorded" not in done.stdout
+
+
+@pytest.mark.parametrize("options", EVERY_TIME, ids=lambda options: options[0])
+def test_an_example_replays(options: tuple[str, ...], tmp_path: Path) -> None:
+    replays(options, "process", tmp_path)
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("options", EVERY_TIME + LONG, ids=lambda options: options[0])
+def test_each_example_replays(options: tuple[str, ...], backend: str, tmp_path: Path) -> None:
+    replays(options, backend, tmp_path)
+
+
+@pytest.mark.acceptance
+def test_an_example_whose_nodes_have_pythons_of_their_own_replays(tmp_path: Path) -> None:
+    replays(OWN_PYTHONS, "process", tmp_path)
