@@ -10,6 +10,7 @@ from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 OURS, THEIRS, TRUTH = "#3465a4", "#c0392b", "0.65"
 SERIES = ("#3465a4", "#e08b27", "#1b7f4d")
@@ -40,6 +41,11 @@ def panels(drawn: Any, count: int, columns: int) -> list[Any]:
         axes.grid(alpha=0.3)
         axes.tick_params(labelbottom=place + columns >= count)
     return every[:count]
+
+
+def legend_entry(label: str, **style: Any) -> Any:
+    """An entry of a legend that is no line of the axes."""
+    return Line2D([], [], label=label, **style)
 
 
 def bars(

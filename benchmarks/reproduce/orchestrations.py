@@ -25,7 +25,7 @@ from benchmarks.reproduce.experiment import Entry
 from benchmarks.reproduce.kinds import Kind, Reading, Readings
 from benchmarks.reproduce.packets import packet_figures, speed_percent
 from benchmarks.reproduce.page import Section
-from benchmarks.reproduce.tables import Layout, Ours, Published, Remark
+from benchmarks.reproduce.tables import Layout, Ours, Published
 from benchmarks.reproduce.whiskeye_runs import (
     CONNECTIONS,
     ESTIMATE,
@@ -258,7 +258,6 @@ _COLUMNS = [
     Published("published, %", {}),
     Ours("RMS, deg", "rms_deg", "{:.2f}"),
     Ours("RMS at the moment, deg", "known_rms_deg", "{:.2f}"),
-    Remark("digests", "digest"),
 ]
 _KNOWN = {1: published.DELIVERY_PERCENT["imu"], 4: published.SPEED_PERCENT} | {
     6: published.DELIVERY_PERCENT["pose"]

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import os
 import shlex
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -136,13 +138,31 @@ def test_an_orchestration_in_virtual_time_has_a_digest_that_its_command_repeats(
     for picture in ("orchestrations", "orchestrations_computing"):
         assert (tmp_path / f"first/figures/{picture}.png").stat().st_size > 10_000
 
-    program, *words = shlex.split(free["command"])
+    assert repeated(free["command"], tmp_path / "again") == free["digest"]
+
+
+def repeated(command: str, folder: Path) -> str:
+    """The digest of a run by a command of the table."""
+    program, *words = shlex.split(command)
     assert program == "neuros"
     again = subprocess.run(
-        [sys.executable, "-m", "neuros.cli", *words, "-o", str(tmp_path / "again")],
+        [sys.executable, "-m", "neuros.cli", *words, "-o", str(folder)],
         cwd=ROOT,
         capture_output=True,
         text=True,
     )
     assert again.returncode == 0, again.stderr
-    assert orchestrations.digest_of(open_run(tmp_path / "again")) == free["digest"]
+    return orchestrations.digest_of(open_run(folder))
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("run", ["no_discard_limit.30ms-1", "asynchronous.here-2"])
+def test_the_points_of_the_documentation_can_be_repeated(run: str, tmp_path: Path) -> None:
+    libraries = {name: metadata.version(name) for name in ("mujoco", "nest-simulator", "numpy")}
+    libraries["glibc"] = (os.confstr("CS_GNU_LIBC_VERSION") or "").removeprefix("glibc ")
+    page = (ROOT / "docs/reproduce.md").read_text()
+    if any(f"{name} {version}" not in page for name, version in libraries.items()):
+        pytest.skip(f"the page is of other libraries than {libraries}")
+    with (ROOT / "docs/figures/reproduce_orchestrations.csv").open(newline="") as stream:
+        (row,) = (row for row in csv.DictReader(stream) if row["run"] == run)
+    assert repeated(row["command"], tmp_path / "run") == row["digest"]
