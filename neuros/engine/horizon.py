@@ -148,9 +148,10 @@ class Horizon:
         self._under_way[channel].append(arrival_ns)
         self._unhandled[channel].append(arrival_ns)
 
-    def receive(self, channel: str) -> None:
-        """Count a message that has come, in the order of the channel."""
-        self._received[channel] += 1
+    def receive(self, channel: str) -> int:
+        """Count a message that has come, in the order of the channel; returns its number."""
+        number = self._received[channel] = self._received[channel] + 1
+        return number
 
     def arrival_ns(self, channel: str) -> int | None:
         """When the next message of a channel arrives; ``None``: its sender has not told yet."""

@@ -182,8 +182,8 @@ class RosVirtualLoop(VirtualLoop):
     def step(self) -> bool:
         for (connection, channel), events in self._arrived.items():
             while events and (arrival_ns := self.horizon.arrival_ns(channel)) is not None:
-                self.horizon.receive(channel)
-                self._nodes[0].arrive(arrival_ns, connection.index, 0, events.popleft())
+                number = self.horizon.receive(channel)
+                self._nodes[0].arrive(arrival_ns, connection.index, number, events.popleft())
         if self._at_zero is not None:
             zero_ns = self.horizon.zero_ns(self._progress())
             if zero_ns is not None:
