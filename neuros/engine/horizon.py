@@ -212,9 +212,9 @@ class Horizon:
         That is the latest time of a node, once all are ready, no event waits and no message is
         under way. One that has begun tells the others, whose states may never show that.
         """
-        found = [s.progress.zero_ns for s in self._states.values() if s.progress.zero_ns >= 0]
-        if found:
-            return found[0]
+        for state in self._states.values():
+            if state.progress.zero_ns >= 0:
+                return state.progress.zero_ns
         states = {**self._states, self.node: self.state(progress)}
         if not self.neighbours <= states.keys():
             return None
@@ -228,6 +228,11 @@ class Horizon:
                 if target is None or target.received.get(channel.name, 0) != sent:
                     return None
         return max(state.progress.now_ns for state in states.values())
+
+    @property
+    def have_others_begun(self) -> bool:
+        """Whether time 0 of the run has come at another node."""
+        return any(state.progress.zero_ns >= 0 for state in self._states.values())
 
     def ending(self) -> Ending | None:
         """The earliest end of the run that another node knows."""

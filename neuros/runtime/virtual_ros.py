@@ -105,7 +105,6 @@ class RosVirtualLoop(VirtualLoop):
         self._has_posted = False
         self._told = 0  # version of the newest state that the neighbours have
         self._has_news = False
-        self._has_begun = False
         # By connection and channel, what has come, and whose time of arrival is not known yet.
         self._arrived: dict[tuple[Connection, str], deque[Event]] = {}
         self._at_zero: Event | None = None
@@ -189,7 +188,7 @@ class RosVirtualLoop(VirtualLoop):
             if zero_ns is not None:
                 event, self._at_zero = self._at_zero, None
                 self._nodes[0].wait_until(zero_ns)
-                self.now_ns, self._has_begun = zero_ns, True
+                self.now_ns = zero_ns
                 event()
                 return True
         if self._drain is not None and self._end is not None:
@@ -213,6 +212,8 @@ class RosVirtualLoop(VirtualLoop):
         return RosNodeTime(self, name, place)
 
     def _may_handle(self, time_ns: int) -> bool:
+        if not self.has_begun and self.horizon.have_others_begun:
+            return False  # what comes from them is later than time 0
         return not self.horizon.waits_for(time_ns)
 
     def _progress(self, free_ns: int | None = None) -> Progress:
@@ -225,7 +226,7 @@ class RosVirtualLoop(VirtualLoop):
             NEVER_NS if next_ns is None else next_ns,
             free_ns,
             self.is_ready,
-            self.zero_ns if self._has_begun else -1,
+            self.zero_ns if self.has_begun else -1,
             None if self._end is None else Ending(*self._end),
         )
 

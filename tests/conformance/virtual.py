@@ -426,7 +426,7 @@ def differences(project: Project, number: int, backend: str = LOCAL) -> Iterator
         yield from _between(expected, observed(project, timing))
         return
     in_process, found = (launched(project, timing, each) for each in ("in-process", backend))
-    yield from _between(in_process, found)
+    yield from (f"in process against {backend}: {each}" for each in _between(in_process, found))
     end_ns = round(project.seconds * 1e9)
     for name, starts in in_process.starts.items():
         in_process.starts[name] = [start for start in starts if start[0] < end_ns]
