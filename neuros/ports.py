@@ -241,10 +241,10 @@ class VirtualRun(EventLoop, Protocol):
         """Call ``on_end`` at the end of a duration from time 0; go no faster than the factor."""
 
 
-class Voice(Protocol):
+class StatePublisher(Protocol):
     """Publishes the state of a launcher to its peers."""
 
-    def say(self, text: str) -> None:
+    def publish(self, text: str) -> None:
         """Publish the state, also for later subscribers. Any thread."""
 
     def close(self) -> None:
@@ -291,7 +291,7 @@ class Middleware(Protocol):
         names: Sequence[str],
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
-    ) -> Voice:
+    ) -> StatePublisher:
         """Publish the state of the nodes ``names``, and subscribe to that of nodes elsewhere.
 
         ``heard`` is called from any thread with a node and its state; ``None``: the node has ended.
