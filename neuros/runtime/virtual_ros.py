@@ -21,13 +21,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import UInt8MultiArray
 
-from neuros.engine.horizon import NEVER_NS, Channel, Ending, Horizon, NodeState, Progress
+from neuros.engine.horizon import NEVER_NS, Channel, Ending, Horizon, KnownState, Moment
 from neuros.ports import Inbox, Transport, TransportKind
 from neuros.project.model import Connection, NodeFile
 from neuros.project.names import INTERNAL
 from neuros.project.timing import LEAST_DELAY_NS
 from neuros.runtime.local import Event
-from neuros.runtime.virtual import DRAIN_S, Direction, NodeTime, VirtualLoop
+from neuros.runtime.virtual import DRAIN_S, NodeTime, OneWay, VirtualLoop
 from neuros.transport.codecs import HEADER
 from neuros.transport.lean_node import LeanNode
 from neuros.transport.ros import (
@@ -66,6 +66,11 @@ class RosNodeTime(NodeTime):
 
     _loop: RosVirtualLoop
 
+    @property
+    def waits_for(self) -> str:  # type: ignore[override]
+        """The node that this one waits for, and both their times. Any thread."""
+        return self._loop.why_waiting
+
     def announce(self, duration_ns: int) -> None:
         self._loop.tell(self.now_ns + duration_ns)
 
@@ -94,14 +99,16 @@ class RosVirtualLoop(VirtualLoop):
         horizon: of the node.
         publish: publishes the states that it knows.
         is_ready: whether the node has run its initialise hooks.
+        why_waiting: which node keeps this one from its next event; empty if none does.
     """
 
     def __init__(self, seed: str, ros: RosLoop) -> None:
         super().__init__(seed)
         self._ros_loop = ros
         self.horizon: Horizon
-        self.publish: Callable[[Sequence[NodeState]], None]
+        self.publish: Callable[[Sequence[KnownState]], None]
         self.is_ready = False
+        self.why_waiting = ""
         self._has_posted = False
         self._told = 0  # version of the newest state that the neighbours have
         self._has_news = False
@@ -148,7 +155,7 @@ class RosVirtualLoop(VirtualLoop):
         self._arrived.setdefault((connection, channel), deque()).append(event)
         self._wake()
 
-    def learn(self, states: Sequence[NodeState]) -> None:
+    def learn(self, states: Sequence[KnownState]) -> None:
         """States of nodes have come."""
         if not self.horizon.learn(states):
             return
@@ -184,7 +191,7 @@ class RosVirtualLoop(VirtualLoop):
                 number = self.horizon.receive(channel)
                 self._nodes[0].arrive(arrival_ns, connection.index, number, events.popleft())
         if self._at_zero is not None:
-            zero_ns = self.horizon.zero_ns(self._progress())
+            zero_ns = self.horizon.zero_ns(self._moment())
             if zero_ns is not None:
                 event, self._at_zero = self._at_zero, None
                 self._nodes[0].wait_until(zero_ns)
@@ -203,7 +210,7 @@ class RosVirtualLoop(VirtualLoop):
         Args:
             free_ns: when the hook that starts now ends; ``None``: none starts now.
         """
-        state = self.horizon.state(self._progress(free_ns))
+        state = self.horizon.state(self._moment(free_ns))
         if state.version != self._told or self._has_news:
             self._told, self._has_news = state.version, False
             self.publish([state, *self.horizon.others])
@@ -214,14 +221,21 @@ class RosVirtualLoop(VirtualLoop):
     def _may_handle(self, time_ns: int) -> bool:
         if not self.has_begun and self.horizon.have_others_begun:
             return False  # what comes from them is later than time 0
-        return not self.horizon.waits_for(time_ns)
+        other = self.horizon.waits_for(time_ns)
+        self.why_waiting = ""
+        if other:
+            self.why_waiting = (
+                f"waits in virtual time, at {(time_ns - self.zero_ns) / 1e9:g} s, for what node"
+                f" '{other}' may still send before"
+            )
+        return not other
 
-    def _progress(self, free_ns: int | None = None) -> Progress:
+    def _moment(self, free_ns: int | None = None) -> Moment:
         node = self._nodes[0]
         if free_ns is None:
             free_ns = node.now_ns if node.now_ns > node.instant_ns else -1
         next_ns = node.next_ns
-        return Progress(
+        return Moment(
             node.instant_ns,
             NEVER_NS if next_ns is None else next_ns,
             free_ns,
@@ -251,7 +265,7 @@ class VirtualSendingLink(SendingLink):
     def open_in(self, loop: RosVirtualLoop, node_time: NodeTime) -> None:
         """The receiver is there: from now on packets get their times of arrival."""
         self._loop, self._time = loop, node_time
-        self._direction = Direction(loop.seed, "delay", self._connection)
+        self._direction = OneWay(loop.seed, "delay", self._connection)
         self._publish, self.publish = self.publish, self._send
 
     def receive_position(self, data: bytes) -> None:
@@ -275,7 +289,7 @@ class VirtualReceivingLink(ReceivingLink):
         super().__init__(connection, *more)
         self._connection = connection
         self._loop, self._time = loop, node_time
-        self._direction = Direction(loop.seed, "acknowledgement", connection)
+        self._direction = OneWay(loop.seed, "acknowledgement", connection)
 
     def receive(self, data: bytes) -> None:
         packet = self._decode(data) if self.is_open else None
@@ -391,19 +405,19 @@ class _VirtualRos(TransportKind):
 
 VIRTUAL_ROS = _VirtualRos()
 
-_DECODER = msgspec.msgpack.Decoder(list[NodeState])
+_DECODER = msgspec.msgpack.Decoder(list[KnownState])
 
 
 def _end_of_hold() -> None:
     """An event at the end of a hook: then the neighbours learn that the node is free."""
 
 
-def _publish(publisher: Publisher, states: Sequence[NodeState]) -> None:
+def _publish(publisher: Publisher, states: Sequence[KnownState]) -> None:
     data = msgspec.msgpack.encode(states)
     publisher.handle.publish_raw(_ARRAY.pack(HEADER, 0, 0, len(data)) + data)
 
 
-def _states_in(data: bytes) -> list[NodeState]:
+def _states_in(data: bytes) -> list[KnownState]:
     *_, size = _ARRAY.unpack_from(data)
     return _DECODER.decode(data[_ARRAY.size : _ARRAY.size + size])
 

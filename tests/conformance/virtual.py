@@ -150,7 +150,10 @@ def launched(project: Project, timing: Timing, backend: str) -> Trace:
         for node in project.nodes:
             lines = (output / node.name / "observed.jsonl").read_text().splitlines()[1:]
             seen = [json.loads(line) for line in lines]
-            trace.starts[node.name] = [(ns, hook, taken) for hook, ns, _, taken, _ in seen]
+            # Finalise hooks see the last time of their node, or of all nodes of their process.
+            trace.starts[node.name] = [
+                (ns, hook, taken) for hook, ns, _, taken, _ in seen if hook != "end"
+            ]
         trace.received |= {key: each["received"] for key, each in run.connections.items()}
     return trace
 
