@@ -146,7 +146,11 @@ class NodeEvents(Protocol):
 
     Attributes:
         clock: monotonic clock in nanoseconds.
+        waits_for: what keeps an event that is next from being handled, as a sentence; mostly empty.
     """
+
+    @property
+    def waits_for(self) -> str: ...
 
     @property
     def clock(self) -> Callable[[], int]: ...

@@ -101,7 +101,8 @@ THIRD_PARTY: dict[str, set[str]] = {
     }
     | MESSAGES,
     "transport.memory": set(),
-    "runtime": {"rclpy"},
+    "runtime": {"rclpy", "std_msgs"},
+    "runtime.virtual_ros": {"rclpy", "std_msgs", "msgspec"},
     "simulators.mujoco": {"mujoco", "numpy", "OpenGL", "glfw"} | MESSAGES,
     "snn": {"numpy"},
     "tf": {"geometry_msgs"},

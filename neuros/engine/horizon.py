@@ -77,7 +77,7 @@ class Ending(NamedTuple):
     drain_ns: int
 
 
-class Progress(NamedTuple):
+class Moment(NamedTuple):
     """What a node has come to; times in nanoseconds of virtual time.
 
     Attributes:
@@ -97,7 +97,7 @@ class Progress(NamedTuple):
     ending: Ending | None = None
 
 
-class NodeState(NamedTuple):
+class KnownState(NamedTuple):
     """The state of one node; ``version`` grows with each change.
 
     Attributes:
@@ -107,7 +107,7 @@ class NodeState(NamedTuple):
 
     node: str
     version: int
-    progress: Progress
+    moment: Moment
     sources: Sequence[str]
     outboxes: Sequence[Outbox]
     received: Mapping[str, int]
@@ -136,8 +136,8 @@ class Horizon:
         # Arrival times of the messages that are not received, and not handled, as far as is known.
         self._under_way: dict[str, deque[int]] = {name: deque() for name in self._outward}
         self._unhandled: dict[str, deque[int]] = {name: deque() for name in self._outward}
-        self._states: dict[str, NodeState] = {}
-        self._own = NodeState(node, 0, Progress(), self._sources, (), {})
+        self._states: dict[str, KnownState] = {}
+        self._own = KnownState(node, 0, Moment(), self._sources, (), {})
         self._reach_ns: dict[str, int] = {}
 
     # ------------------------------------------------------------------ what happens
@@ -148,9 +148,10 @@ class Horizon:
         self._under_way[channel].append(arrival_ns)
         self._unhandled[channel].append(arrival_ns)
 
-    def receive(self, channel: str) -> None:
-        """Count a message that has come, in the order of the channel."""
-        self._received[channel] += 1
+    def receive(self, channel: str) -> int:
+        """Count a message that has come, in the order of the channel; returns its number."""
+        number = self._received[channel] = self._received[channel] + 1
+        return number
 
     def arrival_ns(self, channel: str) -> int | None:
         """When the next message of a channel arrives; ``None``: its sender has not told yet."""
@@ -160,7 +161,7 @@ class Horizon:
                 return outbox.arrival_ns(self._received[channel])
         return None
 
-    def learn(self, states: Iterable[NodeState]) -> bool:
+    def learn(self, states: Iterable[KnownState]) -> bool:
         """Keep the states that are newer than what is known; returns whether there was one."""
         has_news = False
         for state in states:
@@ -177,7 +178,7 @@ class Horizon:
 
     # ------------------------------------------------------------------ what follows
 
-    def state(self, progress: Progress) -> NodeState:
+    def state(self, moment: Moment) -> KnownState:
         """The state of the node now; it has a new version if anything has changed."""
         outboxes = tuple(
             Outbox(channel, self._sent[name] - len(under_way), tuple(under_way))
@@ -186,14 +187,14 @@ class Horizon:
             )
         )
         _, version, *old = self._own
-        if [progress, self._sources, outboxes, self._received] != old:
-            self._own = NodeState(
-                self.node, version + 1, progress, self._sources, outboxes, dict(self._received)
+        if [moment, self._sources, outboxes, self._received] != old:
+            self._own = KnownState(
+                self.node, version + 1, moment, self._sources, outboxes, dict(self._received)
             )
         return self._own
 
     @property
-    def others(self) -> Iterable[NodeState]:
+    def others(self) -> Iterable[KnownState]:
         """The newest states of the other nodes."""
         return self._states.values()
 
@@ -205,39 +206,44 @@ class Horizon:
         arrival_ns, source = min(self._arrivals(), default=(NEVER_NS, ""))
         return source if arrival_ns <= time_ns else ""
 
-    def zero_ns(self, progress: Progress) -> int | None:
+    def zero_ns(self, moment: Moment) -> int | None:
         """Time 0 of the run: when nothing is left to do before it; ``None``: not yet.
 
         That is the latest time of a node, once all are ready, no event waits and no message is
         under way. One that has begun tells the others, whose states may never show that.
         """
-        found = [s.progress.zero_ns for s in self._states.values() if s.progress.zero_ns >= 0]
-        if found:
-            return found[0]
-        states = {**self._states, self.node: self.state(progress)}
+        for state in self._states.values():
+            if state.moment.zero_ns >= 0:
+                return state.moment.zero_ns
+        states = {**self._states, self.node: self.state(moment)}
         if not self.neighbours <= states.keys():
             return None
         for state in states.values():
-            is_idle = state.progress.next_ns == NEVER_NS and state.progress.free_ns < 0
-            if not (is_idle and state.progress.is_ready and states.keys() >= {*state.sources}):
+            is_idle = state.moment.next_ns == NEVER_NS and state.moment.free_ns < 0
+            if not (is_idle and state.moment.is_ready and states.keys() >= {*state.sources}):
                 return None
             for channel, confirmed, arrivals_ns in state.outboxes:
                 target = states.get(channel.target)
                 sent = confirmed + len(arrivals_ns)
                 if target is None or target.received.get(channel.name, 0) != sent:
                     return None
-        return max(state.progress.now_ns for state in states.values())
+        return max(state.moment.now_ns for state in states.values())
+
+    @property
+    def have_others_begun(self) -> bool:
+        """Whether time 0 of the run has come at another node."""
+        return any(state.moment.zero_ns >= 0 for state in self._states.values())
 
     def ending(self) -> Ending | None:
         """The earliest end of the run that another node knows."""
-        known = (s.progress.ending for s in self._states.values())
+        known = (s.moment.ending for s in self._states.values())
         return min((each for each in known if each is not None), default=None)
 
     def reach_ns(self) -> Mapping[str, int]:
         """By node, the least time over connections, in either direction."""
         if not self._reach_ns:
             ways: dict[str, list[tuple[str, int]]] = {}
-            for state in [self.state(self._own.progress), *self._states.values()]:
+            for state in [self.state(self._own.moment), *self._states.values()]:
                 for (_, target, delay_ns), _, _ in state.outboxes:
                     ways.setdefault(state.node, []).append((target, delay_ns))
                     ways.setdefault(target, []).append((state.node, delay_ns))
@@ -252,19 +258,19 @@ class Horizon:
 
     # ------------------------------------------------------------------ inside
 
-    def _forget(self, name: str, state: NodeState) -> None:
+    def _forget(self, name: str, state: KnownState) -> None:
         """Forget messages that the receiver has received, or handled, by its state."""
         under_way, unhandled = self._under_way[name], self._unhandled[name]
         left = self._sent[name] - state.received.get(name, 0)
         while len(under_way) > left:
             under_way.popleft()
-        while len(unhandled) > left and unhandled[0] < state.progress.now_ns:
+        while len(unhandled) > left and unhandled[0] < state.moment.now_ns:
             unhandled.popleft()
 
     def _arrivals(self) -> Iterable[tuple[int, str]]:
         """The earliest times of messages to the node, and of an end, each with its sender."""
         states, own = self._states, self._received
-        first = {name: state.progress.next_ns for name, state in states.items()}
+        first = {name: state.moment.next_ns for name, state in states.items()}
         for neighbour in self.neighbours:
             if neighbour not in states:
                 yield 0, neighbour
@@ -291,7 +297,7 @@ class Horizon:
             time_ns, name = heapq.heappop(waiting)
             if time_ns > first[name]:
                 continue
-            free_ns = states[name].progress.free_ns
+            free_ns = states[name].moment.free_ns
             sent_ns = time_ns if free_ns < 0 else free_ns
             for channel, _, _ in states[name].outboxes:
                 arrival_ns = sent_ns + channel.delay_ns
@@ -302,5 +308,5 @@ class Horizon:
                     heapq.heappush(waiting, (arrival_ns, channel.target))
         reach_ns = self.reach_ns()
         for name, time_ns in first.items():
-            free_ns = states[name].progress.free_ns
+            free_ns = states[name].moment.free_ns
             yield (time_ns if free_ns < 0 else free_ns) + reach_ns[name], name

@@ -93,6 +93,8 @@ class NodeReports:
             metrics = snapshot(engine, now_ns)
             executing = metrics["executing"]
             reasons = () if executing else tuple(explain(engine, now_ns))
+            if reasons and (waits := self._middleware.loop_of(self._file).waits_for):
+                reasons = (waits,)
             is_long = engine.is_stopped or (executing and executing["for_s"] >= LONG_S)
             if is_long and threading.current_thread() is not _MAIN:  # which is between two hooks
                 stack = stack_in(self._file.node.name, self._file.node.plugin)

@@ -55,10 +55,13 @@ class LocalLoop:
 
     Attributes:
         clock: that clock.
+        waits_for: nothing, ever.
         post: handle an event after all waiting events.
         ros: the loop of ROS, once there is one; see :meth:`serve`.
         interruption: raised before the next event; see :meth:`interrupt`.
     """
+
+    waits_for = ""
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
         self.clock = clock

@@ -43,6 +43,8 @@ class NodeTime:
         starts: how many hooks have started at ``now_ns``.
     """
 
+    waits_for = ""
+
     def __init__(self, loop: VirtualLoop, name: str, place: int) -> None:
         self._loop = loop
         self._name = name
@@ -420,7 +422,7 @@ def reach_ns(connections: Iterable[Connection], start: str) -> dict[str, int]:
     return found
 
 
-class Direction:
+class OneWay:
     """One direction of a connection: when its packets, or its acknowledgements, arrive.
 
     Args:
@@ -463,8 +465,8 @@ class VirtualLink(MemoryLink):
 
     def begin_anew(self, seed: str) -> None:
         """The first packet, and the first acknowledgement, come next."""
-        self._there = Direction(seed, "delay", self.connection)
-        self._back = Direction(seed, "acknowledgement", self.connection)
+        self._there = OneWay(seed, "delay", self.connection)
+        self._back = OneWay(seed, "acknowledgement", self.connection)
 
     def send(self, packet: Any, digest: int | None) -> None:
         way = self._there.send(self._source.now_ns)

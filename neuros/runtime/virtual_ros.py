@@ -21,13 +21,13 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import UInt8MultiArray
 
-from neuros.engine.horizon import NEVER_NS, Channel, Ending, Horizon, NodeState, Progress
+from neuros.engine.horizon import NEVER_NS, Channel, Ending, Horizon, KnownState, Moment
 from neuros.ports import Inbox, Transport, TransportKind
 from neuros.project.model import Connection, NodeFile
 from neuros.project.names import INTERNAL
 from neuros.project.timing import LEAST_DELAY_NS
 from neuros.runtime.local import Event
-from neuros.runtime.virtual import DRAIN_S, Direction, NodeTime, VirtualLoop
+from neuros.runtime.virtual import DRAIN_S, NodeTime, OneWay, VirtualLoop
 from neuros.transport.codecs import HEADER
 from neuros.transport.lean_node import LeanNode
 from neuros.transport.ros import (
@@ -66,6 +66,11 @@ class RosNodeTime(NodeTime):
 
     _loop: RosVirtualLoop
 
+    @property
+    def waits_for(self) -> str:  # type: ignore[override]
+        """The node that this one waits for, and both their times. Any thread."""
+        return self._loop.why_waiting
+
     def announce(self, duration_ns: int) -> None:
         self._loop.tell(self.now_ns + duration_ns)
 
@@ -94,18 +99,19 @@ class RosVirtualLoop(VirtualLoop):
         horizon: of the node.
         publish: publishes the states that it knows.
         is_ready: whether the node has run its initialise hooks.
+        why_waiting: which node keeps this one from its next event; empty if none does.
     """
 
     def __init__(self, seed: str, ros: RosLoop) -> None:
         super().__init__(seed)
         self._ros_loop = ros
         self.horizon: Horizon
-        self.publish: Callable[[Sequence[NodeState]], None]
+        self.publish: Callable[[Sequence[KnownState]], None]
         self.is_ready = False
+        self.why_waiting = ""
         self._has_posted = False
         self._told = 0  # version of the newest state that the neighbours have
         self._has_news = False
-        self._has_begun = False
         # By connection and channel, what has come, and whose time of arrival is not known yet.
         self._arrived: dict[tuple[Connection, str], deque[Event]] = {}
         self._at_zero: Event | None = None
@@ -149,7 +155,7 @@ class RosVirtualLoop(VirtualLoop):
         self._arrived.setdefault((connection, channel), deque()).append(event)
         self._wake()
 
-    def learn(self, states: Sequence[NodeState]) -> None:
+    def learn(self, states: Sequence[KnownState]) -> None:
         """States of nodes have come."""
         if not self.horizon.learn(states):
             return
@@ -182,14 +188,14 @@ class RosVirtualLoop(VirtualLoop):
     def step(self) -> bool:
         for (connection, channel), events in self._arrived.items():
             while events and (arrival_ns := self.horizon.arrival_ns(channel)) is not None:
-                self.horizon.receive(channel)
-                self._nodes[0].arrive(arrival_ns, connection.index, 0, events.popleft())
+                number = self.horizon.receive(channel)
+                self._nodes[0].arrive(arrival_ns, connection.index, number, events.popleft())
         if self._at_zero is not None:
-            zero_ns = self.horizon.zero_ns(self._progress())
+            zero_ns = self.horizon.zero_ns(self._moment())
             if zero_ns is not None:
                 event, self._at_zero = self._at_zero, None
                 self._nodes[0].wait_until(zero_ns)
-                self.now_ns, self._has_begun = zero_ns, True
+                self.now_ns = zero_ns
                 event()
                 return True
         if self._drain is not None and self._end is not None:
@@ -204,7 +210,7 @@ class RosVirtualLoop(VirtualLoop):
         Args:
             free_ns: when the hook that starts now ends; ``None``: none starts now.
         """
-        state = self.horizon.state(self._progress(free_ns))
+        state = self.horizon.state(self._moment(free_ns))
         if state.version != self._told or self._has_news:
             self._told, self._has_news = state.version, False
             self.publish([state, *self.horizon.others])
@@ -213,19 +219,28 @@ class RosVirtualLoop(VirtualLoop):
         return RosNodeTime(self, name, place)
 
     def _may_handle(self, time_ns: int) -> bool:
-        return not self.horizon.waits_for(time_ns)
+        if not self.has_begun and self.horizon.have_others_begun:
+            return False  # what comes from them is later than time 0
+        other = self.horizon.waits_for(time_ns)
+        self.why_waiting = ""
+        if other:
+            self.why_waiting = (
+                f"waits in virtual time, at {(time_ns - self.zero_ns) / 1e9:g} s, for what node"
+                f" '{other}' may still send before"
+            )
+        return not other
 
-    def _progress(self, free_ns: int | None = None) -> Progress:
+    def _moment(self, free_ns: int | None = None) -> Moment:
         node = self._nodes[0]
         if free_ns is None:
             free_ns = node.now_ns if node.now_ns > node.instant_ns else -1
         next_ns = node.next_ns
-        return Progress(
+        return Moment(
             node.instant_ns,
             NEVER_NS if next_ns is None else next_ns,
             free_ns,
             self.is_ready,
-            self.zero_ns if self._has_begun else -1,
+            self.zero_ns if self.has_begun else -1,
             None if self._end is None else Ending(*self._end),
         )
 
@@ -250,7 +265,7 @@ class VirtualSendingLink(SendingLink):
     def open_in(self, loop: RosVirtualLoop, node_time: NodeTime) -> None:
         """The receiver is there: from now on packets get their times of arrival."""
         self._loop, self._time = loop, node_time
-        self._direction = Direction(loop.seed, "delay", self._connection)
+        self._direction = OneWay(loop.seed, "delay", self._connection)
         self._publish, self.publish = self.publish, self._send
 
     def receive_position(self, data: bytes) -> None:
@@ -274,7 +289,7 @@ class VirtualReceivingLink(ReceivingLink):
         super().__init__(connection, *more)
         self._connection = connection
         self._loop, self._time = loop, node_time
-        self._direction = Direction(loop.seed, "acknowledgement", connection)
+        self._direction = OneWay(loop.seed, "acknowledgement", connection)
 
     def receive(self, data: bytes) -> None:
         packet = self._decode(data) if self.is_open else None
@@ -390,19 +405,19 @@ class _VirtualRos(TransportKind):
 
 VIRTUAL_ROS = _VirtualRos()
 
-_DECODER = msgspec.msgpack.Decoder(list[NodeState])
+_DECODER = msgspec.msgpack.Decoder(list[KnownState])
 
 
 def _end_of_hold() -> None:
     """An event at the end of a hook: then the neighbours learn that the node is free."""
 
 
-def _publish(publisher: Publisher, states: Sequence[NodeState]) -> None:
+def _publish(publisher: Publisher, states: Sequence[KnownState]) -> None:
     data = msgspec.msgpack.encode(states)
     publisher.handle.publish_raw(_ARRAY.pack(HEADER, 0, 0, len(data)) + data)
 
 
-def _states_in(data: bytes) -> list[NodeState]:
+def _states_in(data: bytes) -> list[KnownState]:
     *_, size = _ARRAY.unpack_from(data)
     return _DECODER.decode(data[_ARRAY.size : _ARRAY.size + size])
 

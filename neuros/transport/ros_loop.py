@@ -77,6 +77,8 @@ class RosLoop:
         turns: how many turns the events of engines have had.
     """
 
+    waits_for = ""
+
     def __init__(self, context: Context, on_failure: Callable[[BaseException], None]) -> None:
         self.clock = time.monotonic_ns
         self._executor = make_executor(context, on_failure)

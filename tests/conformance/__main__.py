@@ -30,7 +30,7 @@ def main() -> int:
     options = _options()
     projects = drawn(options.runs, options.seed)
     if options.time == "virtual":
-        return _compare(projects)
+        return _compare(projects, (options.backend or [LOCAL])[0], options.only)
     cases = [
         Case(f"{options.seed}-{number}", backend, project)
         for number, project in enumerate(projects)
@@ -54,11 +54,13 @@ def main() -> int:
     return 1 if failed else 0
 
 
-def _compare(projects: Sequence[Project]) -> int:
+def _compare(projects: Sequence[Project], backend: str, only: int | None) -> int:
     """Compare runs in virtual time with the naive model; returns the exit code."""
     began_s, wrong = time.monotonic(), 0
     for number, project in enumerate(projects):
-        if found := [*differences(project, number)]:
+        if only is not None and number != only:
+            continue
+        if found := [*differences(project, number, backend)]:
             wrong += 1
             print(f"{number}:", *found, sep="\n  ", flush=True)
         if (number + 1) % 100 == 0:
@@ -93,7 +95,8 @@ def _options() -> argparse.Namespace:
         "--time",
         choices=("real", "virtual"),
         default="real",
-        help="virtual: in sessions of this program, compared with a naive model (real)",
+        help="virtual: in sessions of this program, or on the back end, compared with a naive"
+        " model (real)",
     )
     parser.add_argument("--only", type=int, help="only the project of this number")
     parser.add_argument("--jobs", type=int, default=2, help="so many runs at a time (2)")

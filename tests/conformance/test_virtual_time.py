@@ -8,8 +8,14 @@ from .projects import drawn
 from .virtual import differences
 
 PROJECTS = 24
+BETWEEN_PROCESSES = 4
 
 
 @pytest.mark.parametrize("number", range(PROJECTS))
 def test_a_random_project_starts_its_hooks_when_the_model_does(number: int) -> None:
     assert [*differences(drawn(1, 500 + number)[0], number)] == []
+
+
+@pytest.mark.parametrize("number", range(BETWEEN_PROCESSES))
+def test_nodes_in_processes_of_their_own_do_the_same(number: int) -> None:
+    assert [*differences(drawn(1, 600 + number)[0], number, "process")] == []

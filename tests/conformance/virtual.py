@@ -22,6 +22,7 @@ from neuros.project.timing import Distribution, Draws
 from tests.engine.naive_node import NaiveHook, NaiveNode
 
 from .description import Hook, Project, tidied
+from .running import LOCAL
 
 DURATIONS: list[Any] = [
     *(0.001, 0.002, 0.005, 0.01, 0.04),
@@ -133,6 +134,27 @@ def observed(project: Project, timing: Timing) -> Trace:
                 assert counters is not None
                 incoming = counters.metrics["incoming"]
                 trace.received |= {key: c["received"] for key, c in incoming.items()}
+    return trace
+
+
+def launched(project: Project, timing: Timing, backend: str) -> Trace:
+    """What NeuROS does on a back end of ``launch``, until the project has drained."""
+    trace = Trace()
+    with tempfile.TemporaryDirectory(prefix="neuros-virtual-") as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loaded = neuros.Project.from_file(write(project, timing, Path(folder)))
+        output = Path(folder) / "run"
+        run = loaded.run(
+            backend=backend, duration=project.seconds, output=output, check=True, digests=True
+        )
+        for node in project.nodes:
+            lines = (output / node.name / "observed.jsonl").read_text().splitlines()[1:]
+            seen = [json.loads(line) for line in lines]
+            # Finalise hooks see the last time of their node, or of all nodes of their process.
+            trace.starts[node.name] = [
+                (ns, hook, taken) for hook, ns, _, taken, _ in seen if hook != "end"
+            ]
+        trace.received |= {key: each["received"] for key, each in run.connections.items()}
     return trace
 
 
@@ -392,13 +414,30 @@ def _spec(hook: Hook) -> HookSpec:
     )
 
 
-def differences(project: Project, number: int) -> Iterator[str]:
-    """How what NeuROS does in virtual time differs from the model; nothing if it does not."""
+def differences(project: Project, number: int, backend: str = LOCAL) -> Iterator[str]:
+    """How what NeuROS does in virtual time differs from the model; nothing if it does not.
+
+    A launched run drains, which the model knows nothing of: all of it is compared with a run in
+    process, and that up to the end of the duration with the model.
+    """
     project = for_virtual_time(project)
     if not project.nodes:
         return
     timing = timing_of(project, number)
-    expected, found = Model(project, timing).run(), observed(project, timing)
+    expected = Model(project, timing).run()
+    if backend == LOCAL:
+        yield from _between(expected, observed(project, timing))
+        return
+    in_process, found = (launched(project, timing, each) for each in ("in-process", backend))
+    yield from (f"in process against {backend}: {each}" for each in _between(in_process, found))
+    end_ns = round(project.seconds * 1e9)
+    for name, starts in in_process.starts.items():
+        in_process.starts[name] = [start for start in starts if start[0] < end_ns]
+    in_process.received = expected.received
+    yield from _between(expected, in_process)
+
+
+def _between(expected: Trace, found: Trace) -> Iterator[str]:
     for name, starts in expected.starts.items():
         for place, (wanted, seen) in enumerate(zip(starts, found.starts[name], strict=False)):
             if list(wanted) != list(seen):

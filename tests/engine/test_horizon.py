@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from neuros.engine import horizon
-from neuros.engine.horizon import NEVER_NS, Horizon, Progress
+from neuros.engine.horizon import NEVER_NS, Horizon, Moment
 
 END_NS = 3_000
 """Nodes send nothing after this time."""
@@ -123,7 +123,7 @@ class Apart:
         self.last: dict[int, int] = {}
         self.now_ns = [0] * len(nodes)
         self.states_sent = 0
-        self.told: list[list[horizon.NodeState]] = [[] for _ in nodes]
+        self.told: list[list[horizon.KnownState]] = [[] for _ in nodes]
         self.horizons = [self.horizon_of(node) for node in nodes]
 
     def horizon_of(self, node: Behaviour) -> Horizon:
@@ -151,7 +151,7 @@ class Apart:
                 target = self.channels[channel].target
                 self.put(node.name, target, str(channel), (channel, arrival_ns))
         free_ns = -1 if node.free_ns is None else node.free_ns
-        state = mine.state(Progress(self.now_ns[node.name], node.next_ns, free_ns))
+        state = mine.state(Moment(self.now_ns[node.name], node.next_ns, free_ns))
         states = [state, *mine.others]
         if states != self.told[node.name]:
             self.told[node.name] = states
@@ -218,7 +218,7 @@ def test_a_source_without_answers_waits_for_a_slow_receiver() -> None:
     """Its messages wait at the receiver: their number stays within bounds."""
     source = Horizon("source", {}, [horizon.Channel("c", "sink", 10)])
     receiver = Horizon("sink", {"c": "source"}, [])
-    source.learn([receiver.state(Progress(0, NEVER_NS))])
+    source.learn([receiver.state(Moment(0, NEVER_NS))])
     assert source.waits_for(0) == ""
     time_ns = sent = 0
     while not source.waits_for(time_ns):
@@ -228,15 +228,15 @@ def test_a_source_without_answers_waits_for_a_slow_receiver() -> None:
     assert source.waits_for(time_ns) == "sink"
     for _ in range(sent):
         receiver.receive("c")
-    source.learn([receiver.state(Progress(0, 10))])
+    source.learn([receiver.state(Moment(0, 10))])
     assert source.waits_for(time_ns) == "sink"  # received, and not handled
-    source.learn([receiver.state(Progress(time_ns, time_ns))])
+    source.learn([receiver.state(Moment(time_ns, time_ns))])
     assert source.waits_for(time_ns) == ""
 
 
 def test_messages_with_a_long_delay_are_no_backlog() -> None:
     source = Horizon("source", {}, [horizon.Channel("c", "sink", 1_000_000)])
-    source.learn([Horizon("sink", {"c": "source"}, []).state(Progress(0, NEVER_NS))])
+    source.learn([Horizon("sink", {"c": "source"}, []).state(Moment(0, NEVER_NS))])
     for time_ns in range(10_000):
         assert source.waits_for(time_ns) == ""
         source.send("c", time_ns + 1_000_000)
