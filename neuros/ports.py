@@ -141,7 +141,30 @@ class PacketRecorder(Protocol):
         """End the recording."""
 
 
-class EventLoop(Protocol):
+class NodeEvents(Protocol):
+    """The events of a node, or of all nodes of a process.
+
+    Attributes:
+        clock: monotonic clock in nanoseconds.
+    """
+
+    @property
+    def clock(self) -> Callable[[], int]: ...
+
+    def post(self, event: Callable[[], None]) -> None:
+        """Handle ``event`` after all waiting events. Loop thread only."""
+
+    def post_loop_back(self, event: Callable[[], None]) -> None:
+        """As :meth:`post`, also after all events that wait in ROS."""
+
+    def post_from_thread(self, event: Callable[[], None]) -> None:
+        """As :meth:`post`, from any thread; wakes the loop."""
+
+    def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Callable[[], None]) -> None:
+        """Call ``on_due`` whenever the clock reaches ``next_due_ns()``."""
+
+
+class EventLoop(NodeEvents, Protocol):
     """The thread of all nodes of a process: one event at a time, oldest first."""
 
     @property
@@ -155,23 +178,55 @@ class EventLoop(Protocol):
     def note_execution(self) -> None:
         """A hook, or a callback of a plugin, has ended; packets may have arrived meanwhile."""
 
-    def post(self, event: Callable[[], None]) -> None:
-        """Handle ``event`` after all waiting events. Loop thread only."""
-
-    def post_loop_back(self, event: Callable[[], None]) -> None:
-        """As :meth:`post`, also after all events that wait in ROS."""
-
-    def post_from_thread(self, event: Callable[[], None]) -> None:
-        """As :meth:`post`, from any thread; wakes the loop."""
-
-    def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Callable[[], None]) -> None:
-        """Call ``on_due`` whenever the monotonic clock reaches ``next_due_ns()``."""
-
     def run(self) -> None:
         """Handle events until :meth:`stop`."""
 
     def stop(self) -> None:
         """End :meth:`run` after the current event. Any thread."""
+
+
+class NodeLoop(NodeEvents, Protocol):
+    """The clock and the events of one node in virtual time.
+
+    Attributes:
+        seed: from which durations, delays and losses are drawn.
+        zero_ns: time 0 of the run.
+        starts: how many hooks have started at this instant.
+    """
+
+    starts: int
+
+    @property
+    def seed(self) -> str: ...
+    @property
+    def zero_ns(self) -> int: ...
+
+    def hold(self, duration_ns: int) -> None:
+        """The hook that has just run takes so long."""
+
+    def at(self, time_ns: int, event: Callable[[], None]) -> None:
+        """Handle an event at a time, or now if that has passed."""
+
+    def begin(self) -> None:
+        """Time 0 of the run has come."""
+
+    def end(self, drain_s: float) -> None:
+        """The node asks for the end: nothing happens after this instant until :meth:`drain`."""
+
+    def drain(self, event: Callable[[], None], stop: Callable[[], None]) -> None:
+        """Handle ``event`` when the end reaches the node; ``stop`` it if it drains for too long."""
+
+
+class VirtualRun(EventLoop, Protocol):
+    """The loop of a process in virtual time."""
+
+    def plan(
+        self,
+        duration_s: float | None,
+        on_end: Callable[[], None],
+        real_time_factor: float | None,
+    ) -> None:
+        """Call ``on_end`` at the end of a duration from time 0; go no faster than the factor."""
 
 
 class Voice(Protocol):
@@ -192,6 +247,14 @@ class Middleware(Protocol):
 
     @property
     def packets(self) -> Packets: ...
+
+    def loop_of(self, file: NodeFile) -> NodeEvents:
+        """The clock and the events of one node."""
+
+    def begin_anew(
+        self, files: Sequence[NodeFile], variables: Mapping[str, Mapping[str, str]]
+    ) -> None:
+        """All nodes are about to be reset, with these variables in their environments."""
 
     def transport(self, file: NodeFile) -> Transport:
         """The transport of one node; creates its ROS node."""
@@ -265,8 +328,28 @@ Advance: TypeAlias = "Callable[[], Mapping[str, Packet]]"
 """Steps a world that runs by itself, to packets that are due or less far; returns them."""
 
 
+class VirtualClock(Protocol):
+    """The clock of a run in virtual time, for a simulator that steps itself."""
+
+    def clock_s(self) -> float:
+        """Seconds since time 0 of the run."""
+
+    def when_active(self, event: Callable[[], None]) -> None:
+        """Call ``event`` at time 0 of the run, or now if that has passed."""
+
+    def call_at(self, time_s: float, event: Callable[[], None]) -> None:
+        """Call ``event`` so many seconds after time 0, or now if that has passed."""
+
+    def send(self, packets: Mapping[str, Packet], sent: Callable[[], None]) -> None:
+        """Send packets, by output, as soon as a hook could; then call ``sent``."""
+
+
 class NodeContext(Protocol):
     """The node handle of hooks, as far as simulators need it."""
+
+    @property
+    def virtual_time(self) -> VirtualClock | None:
+        """The clock of a run in virtual time; ``None`` in real time."""
 
     @property
     def name(self) -> str:

@@ -304,7 +304,7 @@ class Execution:
             self._signals,
             listener=self._listener,
             wishes=self._wishes,
-            duration_s=self._plan.request.end.wall_s,
+            duration_s=None if self._plan.project.is_virtual else self._plan.request.end.wall_s,
             finalise_s=self._plan.request.finalise_s,
             peers=Peers(
                 self._run_id,

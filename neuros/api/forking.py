@@ -127,6 +127,8 @@ def _again(
     project = Project.from_file(file)
     described = project.described(chosen)
     why = why_not_repeatable(described)
+    if described.is_virtual:
+        why.append("it is in virtual time, where a fork is one of a session: use session.fork()")
     if json.dumps(project_to_json(described), sort_keys=True) != json.dumps(
         record["expanded_project"], sort_keys=True
     ):

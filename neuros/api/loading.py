@@ -35,7 +35,7 @@ from neuros.project.paths import is_missing, modules_here, why_no_module
 from neuros.project.plugin_files import PluginFile, plugins_of
 from neuros.project.scanner import display_name, problem_in
 from neuros.project.suggest import did_you_mean
-from neuros.recording.provenance import seeds
+from neuros.project.timing import seeds
 from neuros.registry import NAMES, PLUGIN_CHECKS
 
 _LONG_BYTES = 1 << 20
@@ -52,6 +52,8 @@ def load_with_messages(
     overrides: Sequence[str] = (),
     namespace: str | None = None,
     remap: Sequence[str] = (),
+    time: str | None = None,
+    timing: str | os.PathLike[str] | None = None,
     *,
     reads_plugins: bool = True,
 ) -> tuple[LoadedProject, Messages]:
@@ -72,6 +74,8 @@ def load_with_messages(
             packages=workspaces,
             namespace=namespace,
             remap=remap,
+            time=time,
+            timing=None if timing is None else Path(timing),
             reads_plugins=reads_plugins,
         )
     except ProjectError as error:

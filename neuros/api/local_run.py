@@ -40,6 +40,7 @@ from neuros.project.model import Node, NodeFile
 from neuros.project.plugin_files import read_plugin
 from neuros.recording.provenance import GitState, provenance
 from neuros.runtime.local import LocalLoop, LocalMiddleware, Record, log_in_python
+from neuros.runtime.virtual import VirtualLoop, VirtualMiddleware
 from neuros.transport.digests import digest_of
 
 NAME = "local"
@@ -94,16 +95,17 @@ class LocalRun:
         self._is_behind = False
         self._sent: list[Callable[[], None]] = []
         self._is_shown = bool(getattr(request, "show", False))
+        arguments = (self._write, self._fail_in_callback)
+        keywords: dict[str, Any] = {
+            "exposes": exposes,
+            "digest": digest_of if request.digests else None,
+            "level": logging.INFO,
+        }
         self._loop = LocalLoop()
-        digest = digest_of if request.digests else None
-        self._middleware = LocalMiddleware(
-            self._loop,
-            self._write,
-            self._fail_in_callback,
-            exposes=exposes,
-            digest=digest,
-            level=logging.INFO,
-        )
+        self._middleware = LocalMiddleware(self._loop, *arguments, **keywords)
+        if project.is_virtual:
+            loop = self._loop = VirtualLoop(self._files[0].seed)
+            self._middleware = VirtualMiddleware(loop, *arguments, **keywords)
         self._contexts.hide_from_nodes(project.folder)
         self._nodes: dict[str, NodeRuntime] = {}
         self._thread = _Thread(
@@ -226,6 +228,7 @@ class LocalRun:
             for node in nodes:
                 node.pause()  # takes back what is left of steps, which might go on for ever
             self._loop.run_until_idle()
+            self._middleware.begin_anew(self._files, variables)
             for node in nodes:
                 try:
                     node.reset(variables.get(node.name, {}), keep.get(node.name, ()))
@@ -473,7 +476,8 @@ class LocalRun:
     def _drain(self, drain_s: float, stopped: str) -> None:
         last_round = self._declarations.last_round(stopped)
         try:
-            with self._inside(time.monotonic() + drain_s):
+            is_virtual = self._plan.project.is_virtual
+            with self._inside(None if is_virtual else time.monotonic() + drain_s):
                 for node in self._nodes.values():
                     node.drain(last_round.get(node.name, ()))
                 self._loop.run_until_idle()

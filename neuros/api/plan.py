@@ -16,6 +16,7 @@ from typing import Any
 from neuros.api.kept import Sources, find_sources, given_sources
 from neuros.api.request import Duration, Request
 from neuros.backends.node_command import place, usable_cores, without_mark
+from neuros.backends.process_launchers import WITHOUT_ROS
 from neuros.backends.pythons import Pythons, require_one_python
 from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
@@ -214,11 +215,17 @@ class Plan:
 
     def launcher(self, reaper: Reaper | None = None) -> Launcher:
         """The launcher of the back end; it reports its processes to ``reaper``."""
-        options = ["--transport", self.deployment.transport or self.back_end.transport]
+        transport = self.deployment.transport or self.back_end.transport
+        end, is_virtual = self.request.end, self.project.is_virtual
+        options = ["--transport", WITHOUT_ROS if is_virtual else transport]
+        if is_virtual and end.wall_s is not None:
+            options += ["--duration", repr(end.wall_s)]
+        if self.request.real_time_factor is not None:
+            options += ["--real-time-factor", repr(self.request.real_time_factor)]
         if self.back_end.is_one_process:
             options.append("--one-process")
-        if self.request.end.sim_s is not None:
-            options += ["--duration-sim", repr(self.request.end.sim_s)]
+        if end.sim_s is not None:
+            options += ["--duration-sim", repr(end.sim_s)]
         if self.request.verbose:
             options.append("--debug")
         if self.request.digests and self.back_end.is_one_process:  # others always keep them
@@ -283,6 +290,7 @@ def make_plan(
         )
     if request.isolate:
         _check_isolation(plan)
+    _check_time(plan)
     conflicts = nest_conflicts(project, names) if back_end.is_one_process else ()
     if problems := [*conflicts, *time_problems(project, plan.nodes, request.end)]:
         raise ProjectError(problems)
@@ -373,6 +381,29 @@ def _check_reach(project: Project, chosen: Collection[str], back_end: BackEnd) -
                 f"-n leaves out one end of {connection}, which the {back_end.name} back end"
                 " cannot reach; use --backend docker or process"
             )
+
+
+def _check_time(plan: Plan) -> None:
+    """Refuse virtual time where nodes would run in real time, and a pace of real time."""
+    request = plan.request
+    if not plan.project.is_virtual:
+        if request.real_time_factor is not None:
+            raise UsageError(
+                "--real-time-factor: it is the pace of virtual time: add --time virtual; the"
+                " machine sets that of real time"
+            )
+        return
+    others = {"-n": plan.is_partial, "--network": plan.network.is_wide}
+    for option, is_given in others.items():
+        if is_given:
+            raise UsageError(
+                f"{option}: nodes elsewhere are in real time: leave out --time virtual"
+            )
+    if not plan.back_end.is_one_process:
+        raise UsageError(
+            f"virtual time: the nodes of the back end {plan.back_end.name} are in several"
+            " processes: use --backend in-process"
+        )
 
 
 def _check_isolation(plan: Plan) -> None:

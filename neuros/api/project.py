@@ -426,15 +426,15 @@ class Project:
         self, options: StartOptions, *, is_held: bool = False
     ) -> tuple[Described, Messages]:
         texts = [*override_texts(self.settings), *override_texts(options.set)]
-        names = (options.namespace, options.remap)
-        loaded, messages = load_with_messages(self._source, texts, *names)
+        others = (options.namespace, options.remap, options.time, options.timing)
+        loaded, messages = load_with_messages(self._source, texts, *others)
         if options.seed is not None:
             texts += [
                 f"nodes.{node}.environment.{name}={value}"
                 for node, variables in seed_variables(loaded.project, options.seed).items()
                 for name, value in variables.items()
             ]
-            loaded, messages = load_with_messages(self._source, texts, *names)
+            loaded, messages = load_with_messages(self._source, texts, *others)
         self._warn(loaded, is_held=is_held)
         return loaded.project, messages
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from neuros.errors import UsageError
 from neuros.options import option, options_of, positive_number, positive_seconds
 from neuros.project.model import bytes_of
+from neuros.project.timing import REAL, VIRTUAL
 
 if TYPE_CHECKING:
     from neuros.recording.recording_plan import RecordingRequest
@@ -54,6 +55,20 @@ class ProjectOptions:
         metavar="FROM:=TO",
         help="rename an external topic, or a topic or service of a plugin, as in ROS;"
         " NODE:FROM:=TO renames it for one node only",
+    )
+    time: str | None = option(
+        "--time",
+        choices=(REAL, VIRTUAL),
+        default_help="the project's",
+        page="time.md#virtual-time",
+        help="the clock of the run: that of the machine, or one that only declared durations of"
+        " hooks and delays of connections move on, so that the run can be repeated exactly",
+    )
+    timing: str | os.PathLike[str] | None = option(
+        "--timing",
+        metavar="FILE",
+        page="time.md#virtual-time",
+        help="replace durations and delays of the project in virtual time by those of this file",
     )
 
 
@@ -143,6 +158,14 @@ class Request(ProjectOptions):
         default_help="no limit",
         help="end the run this long after its first hook started, and let packets under way"
         " arrive: 30 means seconds, 30sim simulated seconds",
+    )
+    real_time_factor: float | None = option(
+        "--real-time-factor",
+        parse=positive_seconds,
+        metavar="FACTOR",
+        default_help="as fast as the machine allows",
+        page="time.md#virtual-time",
+        help="let at most this many seconds of virtual time pass per second of the machine",
     )
     output: str | os.PathLike[str] | None = option(
         "-o",

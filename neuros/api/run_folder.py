@@ -39,7 +39,7 @@ from neuros.distribution import WORKSPACE, __version__, python_command
 from neuros.errors import UsageError
 from neuros.project.model import Folders, NodeFile, Project
 from neuros.project.split import node_file_text, project_to_json
-from neuros.recording.provenance import seeds
+from neuros.project.timing import seeds
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, plan_recording
 from neuros.recording.run_file import RUN_FILE, write_run_file
 

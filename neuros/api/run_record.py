@@ -43,6 +43,7 @@ def run_record(
         "wall_s": wall_s,
         "sim_s": sim_s,
         "running_s": running_s,
+        **({"virtual_s": ended.virtual_s} if project.is_virtual else {}),
         "paused_s": ended.paused_s,
         "real_time_factor": ended.real_time_factor,
         "timeline": {
@@ -110,6 +111,8 @@ def run_table(record: Mapping[str, Any]) -> str:
         if value["sha256"]
     ]
     times = f"wall time {record['wall_s']:.2f} s"
+    if record.get("virtual_s") is not None:
+        times = f"virtual time {record['virtual_s']:.2f} s, {times}"
     if record.get("paused_s"):  # missing in records of earlier versions
         times += f" ({record['paused_s']:.2f} s of it paused)"
     if record["sim_s"] is not None:
@@ -132,7 +135,7 @@ def _timeline(points: Sequence[Sequence[float]], ended: Outcome) -> list[list[fl
 
     Simulated time goes back at a reset.
     """
-    start_s = ended.started_s or 0.0
+    start_s = (ended.started_s if ended.virtual_s is None else None) or 0.0
     found: list[list[float]] = []
     for sim_s, wall_s in points:
         if not found or int(sim_s) > int(found[-1][0]) or sim_s < found[-1][0]:

@@ -210,7 +210,12 @@ class Session:
             if duration_s is None:
                 return self._run_sim(check_seconds(duration_sim_s=duration_sim_s))
             duration_s = check_seconds(duration_s=duration_s)
-            self._why_no_fork = "it ran for a wall time (run(duration_s=...)): use duration_sim_s"
+            if self._project.is_virtual:
+                self._note("run", duration_s)
+            else:
+                self._why_no_fork = (
+                    "it ran for a wall time (run(duration_s=...)): use duration_sim_s"
+                )
             return self._take(self._held.run_for(duration_s, self._known))
 
     def reset(
@@ -311,6 +316,8 @@ class Session:
             for what, arguments in journal:
                 if what == "advance":
                     other._advance(arguments[0], None, arguments[1])
+                elif what == "run":
+                    other.run(duration_s=arguments[0])
                 elif what == "send":
                     other._held.deliver(*arguments)
                     other._note(what, *arguments)

@@ -100,6 +100,6 @@ def load_quietly(
     from neuros.api.loading import load_with_messages as load
 
     path = project_path(parsed)
-    changes = (parsed.set, parsed.namespace, parsed.remap)
+    changes = (parsed.set, parsed.namespace, parsed.remap, parsed.time, parsed.timing)
     loaded, messages = load(path, *changes, reads_plugins=reads_plugins)
     return loaded.project, messages, loaded.warnings

@@ -28,6 +28,8 @@ def add_node(node: argparse.ArgumentParser) -> None:
     node.add_argument("--transport", default="ros")
     node.add_argument("--one-process", action="store_true")
     node.add_argument("--duration-sim", type=float)
+    node.add_argument("--duration", type=float)
+    node.add_argument("--real-time-factor", type=float)
     node.add_argument("--digests", action="store_true")
     node.add_argument("--debug", action="store_true")
     node.add_argument("--record", action="store_true")
@@ -83,6 +85,8 @@ def _run_node(options: argparse.Namespace) -> int:
         partial(connect_by, os.environ),
         open_recorder=open_recorder,
         duration_sim_s=options.duration_sim,
+        duration_s=options.duration,
+        real_time_factor=options.real_time_factor,
         is_held=options.held,
         own_logs=options.one_process,
     ).run()

@@ -137,13 +137,14 @@ class Report(Message, kw_only=True):
         sim_time: simulated seconds, ``None`` where the node owns no time.
         expected_end_s: simulated time at which the plugin expects to end the project.
         timeline: further points of simulated and wall time, in seconds.
-        running_since_s: since when the node has been initialised, on the monotonic clock.
+        running_since_s: since when the node has been initialised, on the clock of the run.
         metrics: ``None`` before the node has begun.
         stack: where the plugin stands, if its hook runs for long.
         fault: what cannot be recorded.
         compressed: by connection on which the node compresses, bytes before and after.
         is_driving: whether some hook starts with no packet for it.
         is_final: whether this is the last report.
+        virtual_s: virtual time of the node, ``None`` in real time.
     """
 
     node: str
@@ -158,6 +159,7 @@ class Report(Message, kw_only=True):
     compressed: Mapping[str, tuple[int, int]] = {}
     is_driving: bool = False
     is_final: bool = False
+    virtual_s: float | None = None
 
 
 class Probed(Report, kw_only=True):

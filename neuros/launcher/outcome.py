@@ -89,24 +89,36 @@ class Outcome:
     is_paused: bool = False
 
     @property
+    def virtual_s(self) -> float | None:
+        """Virtual time, which each node has counted; ``None`` in real time."""
+        times = [r.virtual_s for r in self.reports.values() if r.virtual_s is not None]
+        return max(times, default=None)
+
+    @property
+    def _end_s(self) -> float | None:
+        """When the end was asked for, on the clock of the run."""
+        return self.ending_s if self.virtual_s is None else self.virtual_s
+
+    @property
     def running_s(self) -> float | None:
-        """Wall time in which all nodes ran: without initialisation, pauses, draining and the end.
+        """Time in which all nodes ran: without initialisation, pauses, draining and the end.
 
         It counts from when every node had initialised, or, if that was not before the end, from
-        when the node that owns simulated time had.
+        when the node that owns simulated time had. Virtual time includes draining.
         """
+        ending_s = self._end_s
         since = {
             name: report.running_since_s
             for name, report in self.reports.items()
             if report.running_since_s is not None
         }
-        if self.ending_s is None:
+        if ending_s is None:
             return None
         owners = [since[name] for name in since if self.reports[name].sim_time is not None]
-        start_s = max(since.values(), default=self.ending_s)
-        if start_s >= self.ending_s or len(since) < len(self.reports):
-            start_s = max(owners, default=self.ending_s)
-        return max(0.0, self.ending_s - start_s)
+        start_s = max(since.values(), default=ending_s)
+        if start_s >= ending_s or len(since) < len(self.reports):
+            start_s = max(owners, default=ending_s)
+        return max(0.0, ending_s - start_s)
 
     @property
     def real_time_factor(self) -> float | None:
@@ -119,13 +131,13 @@ class Outcome:
             for name, report in self.reports.items()
             if report.sim_time is not None
         }
-        running_s = self.running_s
-        if not times or not running_s or self.ending_s is None:
+        running_s, ending_s = self.running_s, self._end_s
+        if not times or not running_s or ending_s is None:
             return None
         owner = max(times, key=times.__getitem__)
         # Running time leaves pauses out, points of a timeline do not.
-        start_s = self.ending_s - running_s - self.paused_s
-        end = (times[owner], self.ending_s)
+        paused_s = self.paused_s if self.virtual_s is None else 0.0
+        start_s, end = ending_s - running_s - paused_s, (times[owner], ending_s)
         return _advance(self.timelines.get(owner, ()), start_s, end) / running_s
 
     def take(self, report: Report, now_s: float) -> None:

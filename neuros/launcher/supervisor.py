@@ -238,7 +238,8 @@ class Supervisor:
                 self._shutdown.note_progress(node, text)
             case control.Shutdown(node, reason, drain_s):
                 because = f": {reason}" if reason else ""
-                self._shutdown.drain(f"{node} ended the project{because}", drain_s, stopped=node)
+                why = f"{node} ended the project{because}" if node else reason
+                self._shutdown.drain(why, drain_s, stopped=node)
             case control.Failed(node, text) if self._shutdown.counts_failure_of(node):
                 self._processes.note_failure(node)
                 first_line = (text.strip() or "no reason was given").splitlines()[0]

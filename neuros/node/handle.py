@@ -6,7 +6,6 @@ import json
 import math
 import os
 import threading
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -17,7 +16,8 @@ from neuros.node.copies import copy_seeds
 from neuros.node.failures import Failures, as_node_error
 from neuros.node.keeping import Keeping
 from neuros.node.simulated_time import SimulatedTime
-from neuros.ports import Advance, EventLoop, Logger, Packets, WorldLook
+from neuros.node.virtual import VirtualTime, refuse_thread
+from neuros.ports import Advance, Logger, NodeEvents, Packets, WorldLook
 from neuros.project.model import Node, NodeFile
 from neuros.project.suggest import did_you_mean
 
@@ -46,13 +46,14 @@ class PluginServices:
             keeping: what it keeps.
         make_packet: a new packet, for the type of a port.
             time: that of the node, if it has one.
+        virtual_time: that of the run; ``None``: the run is in real time.
         waiting_threads: those that wait until packets that they have offered are sent.
     """
 
     def __init__(
         self,
         packets: Packets,
-        loop: EventLoop,
+        loop: NodeEvents,
         time: SimulatedTime,
         failures: Failures,
         ask_for_end: Callable[..., object],
@@ -66,6 +67,7 @@ class PluginServices:
         self._thread_id = threading.get_ident()
         self.is_ending = False
         self.is_active = threading.Event()
+        self.virtual_time: VirtualTime | None = None
         self.waiting_threads: set[threading.Thread] = set()
         self.make_packet = packets.make
         self._loop = loop
@@ -208,7 +210,7 @@ class NodeHandle:
 
         It is simulated where the node has a simulator or a clock, and 0 before that is known.
         """
-        return self._services.time.stamp(lambda: self.reading(time.time_ns()))
+        return self._services.time.stamp(self.reading)
 
     def make_packet(self, output: str | None = None) -> Any:
         """A new message for an output, with default values, or an array of zeros.
@@ -405,6 +407,11 @@ class NodeHandle:
         """Let observers look at a simulated world, as the dashboard does."""
         self._services.show_world(look)
 
+    @property
+    def virtual_time(self) -> VirtualTime | None:
+        """The clock of a run in virtual time, for a simulator that steps itself."""
+        return self._services.virtual_time
+
     def on_close(self, callback: Callable[[], None]) -> None:
         """Call ``callback`` once when the node ends, after its finalise hooks."""
         self._services.closers.append(callback)
@@ -439,7 +446,12 @@ class NodeHandle:
 
         Waits while a reliable connection of one of the outputs is blocked; returns False, without
         having sent, once ``cancelled()`` is true or the node ends.
+
+        Raises:
+            NodeError: in virtual time.
         """
+        if self.virtual_time is not None:
+            raise refuse_thread(self.name, "submit")
         sent = threading.Event()
         withdraw = self._services.offer_from_thread(packets, sent.set)
         while not sent.wait(_POLL_S):

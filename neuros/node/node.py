@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from neuros.control import AtRest, Finalising, Message, Progress, Ready, Shutdown
 from neuros.control.link import to_bytes
@@ -29,8 +29,18 @@ from neuros.node.plugin import describe, last_line, load_plugin
 from neuros.node.reports import NodeReports
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
-from neuros.ports import Advance, Middleware, PacketRecorder, Transport, Way
+from neuros.node.virtual import Durations, VirtualTime
+from neuros.ports import (
+    Advance,
+    Middleware,
+    NodeEvents,
+    NodeLoop,
+    PacketRecorder,
+    Transport,
+    Way,
+)
 from neuros.project.model import Connection, NodeFile, Port
+from neuros.project.timing import VIRTUAL
 
 LAST_PACKETS = "last_packets"
 """In the folder of a node of a session: its newest packets, when the run has ended."""
@@ -49,7 +59,6 @@ class NodeRuntime:
         recorder: where packets go that are recorded, ``None``: none are.
         duration_sim_s: simulated time at which this node ends the project, ``None``: never.
         on_initialised: called after each initialise hook.
-        clock: monotonic clock in nanoseconds.
         make_engine: the engine, called like its class.
         is_held: whether hooks stand still from the start, as paused, and the newest packets of each
             output are kept.
@@ -78,7 +87,6 @@ class NodeRuntime:
         log_file: Path | None,
         duration_sim_s: float | None,
         on_initialised: Callable[[], None] = lambda: None,
-        clock: Callable[[], int] = time.monotonic_ns,
         make_engine: Callable[..., Engine] = Engine,
         is_held: bool = False,
         is_local: bool = False,
@@ -91,7 +99,10 @@ class NodeRuntime:
         self._has_timer = False
         self.engine: Engine | None = None
         self._middleware = middleware
-        self._clock = clock
+        self._loop = middleware.loop_of(file)
+        self._clock = clock = self._loop.clock
+        # The same loop, if the run is in virtual time.
+        self._virtual = cast(NodeLoop, self._loop) if file.time == VIRTUAL else None
         self._make_engine = make_engine
         self._tell = tell
         self._contexts = contexts
@@ -108,21 +119,29 @@ class NodeRuntime:
         self._logger = ros_node.get_logger()
         self.failures = Failures(self.name, file.node.plugin, self._logger, fail)
         self._guard = self.failures.guard
-        self._time = SimulatedTime(file.node, duration_sim_s, clock, self._end_by_duration)
+        virtual = self._virtual
+        wall_ns = time.time_ns if virtual is None else (lambda: max(0, clock() - virtual.zero_ns))
+        self._time = SimulatedTime(
+            *(file.node, duration_sim_s, clock, self._end_by_duration, wall_ns)
+        )
         sampler = Sampler()
         self.keeping = Keeping(self.name, self.run_dir, file.restored)
         self._services = PluginServices(
             middleware.packets,
-            middleware.loop,
+            self._loop,
             self._time,
             self.failures,
-            lambda reason, drain_s: tell(Shutdown(self.name, reason, drain_s)),
+            self._ask_for_end,
             lambda text: tell(Progress(self.name, text)),
             lambda look: self.reports.show_world(look),
             drive,
             Results(self.run_dir),
             self.keeping,
         )
+        if self._virtual is not None:
+            self._services.virtual_time = VirtualTime(
+                self._virtual, lambda: self._loaded, self.failures
+            )
         self.handle = NodeHandle(file, ros_node, self._services)
         self._recorder: NodeRecorder | None = None
         instruments: list[Instrument] = [self._time, sampler]
@@ -139,8 +158,11 @@ class NodeRuntime:
         self.histories = PacketHistories(packets.encode, copy_of)
         if is_held:
             instruments.append(self.histories)
-        self._effects = NodeEffects(
+        make_effects = NodeEffects if self._virtual is None else VirtualEffects
+        self._effects = make_effects(
             middleware,
+            file,
+            self._loop,
             self._transport,
             self.handle,
             self.failures,
@@ -212,13 +234,15 @@ class NodeRuntime:
         """
         if not self._has_timer and any(spec.kind is HookKind.TICK for spec in self.specs):
             self._has_timer = True
-            self._middleware.loop.add_timer(lambda: self._loaded.next_due_ns, self.on_timer)
+            self._loop.add_timer(lambda: self._loaded.next_due_ns, self.on_timer)
         self._guard(partial(self._loaded.start, awaits_others=awaits_others))
         if not awaits_others:
             self._services.is_active.set()
 
     def activate(self) -> None:
         """Every node of the project is ready: tick and function hooks may start from now on."""
+        if self._services.virtual_time is not None:
+            self._services.virtual_time.activate()
         self._guard(self._loaded.activate)
         self._services.is_active.set()
 
@@ -314,7 +338,11 @@ class NodeRuntime:
 
         Those of ``last_round`` (see :meth:`Engine.drain`) start at most once more.
         """
-        self._guard(lambda: self._loaded.drain(last_round))
+        drain = partial(self._guard, lambda: self._loaded.drain(last_round))
+        if self._virtual is None:
+            drain()
+        else:
+            self._virtual.drain(drain, self.stop)
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`."""
@@ -484,6 +512,18 @@ class NodeRuntime:
         assert self.engine is not None
         return self.engine
 
+    def _ask_for_end(self, reason: str, drain_s: float) -> None:
+        virtual, request = self._virtual, Shutdown(self.name, reason, drain_s)
+        if virtual is None:
+            self._tell(request)
+            return
+
+        def ask() -> None:
+            virtual.end(drain_s)
+            self._tell(request)
+
+        virtual.post(ask)  # at the end of the hook
+
     def _end_by_duration(self, duration_s: float) -> None:
         self._services.shutdown(f"{duration_s:g} s of simulated time", 5.0)
 
@@ -501,6 +541,8 @@ class NodeEffects:
     def __init__(
         self,
         middleware: Middleware,
+        file: NodeFile,
+        loop: NodeEvents,
         transport: Transport,
         handle: NodeHandle,
         failures: Failures,
@@ -511,7 +553,8 @@ class NodeEffects:
         on_ready: Callable[[], object],
         on_initialised: Callable[[], None],
     ) -> None:
-        self._loop, self._copier = middleware.loop, middleware.packets.copier
+        self._middleware, self._file = middleware, file
+        self._loop, self._copier = loop, middleware.packets.copier
         self._transport = transport
         self._handle = handle
         self._guard = failures.guard
@@ -606,6 +649,37 @@ class NodeEffects:
         for observe in tap.observers:
             observe(packet, None)
         return self._copier(port.type)(packet)
+
+
+class VirtualEffects(NodeEffects):
+    """The effects of a node in virtual time: before a hook returns, its duration has passed."""
+
+    _hook: Hook
+    _durations: Durations | None = None
+
+    def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
+        """Run a hook, and hold the node for its duration.
+
+        Raises:
+            HookError: as in real time; if it could start for ever at one instant; if the plugin has
+                ROS call it, which happens in real time.
+        """
+        if self._durations is None:
+            loop = cast(NodeLoop, self._loop)
+            self._durations = Durations(self._file, loop, lambda: self._time.now_s)
+            self._note_execution = self._hold
+        self._hook = hook
+        self._durations.begin(hook)
+        return super().call(hook, arguments)
+
+    def _hold(self) -> None:
+        assert self._durations is not None
+        self._durations.end(self._hook)
+        if self._middleware.has_foreign_entities(self._file):
+            raise self._hook.error(
+                "the plugin has made a subscription, timer, service or client of ROS, which are"
+                " called in real time: use inputs and hooks, or run in real time"
+            )
 
 
 def _to_nobody(packet: Any) -> None:

@@ -14,6 +14,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from typing import cast
 
 import neuros.control as control
 from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Advance, Message
@@ -27,14 +28,16 @@ from neuros.node.node import NodeRuntime
 from neuros.node.peer_link import PeerLink
 from neuros.node.reports import declared
 from neuros.node.saving import Saving
-from neuros.ports import ControlStream, Middleware, PacketRecorder
+from neuros.ports import ControlStream, Middleware, PacketRecorder, VirtualRun
 from neuros.project.model import Connection, NodeFile
+from neuros.project.timing import VIRTUAL
 from neuros.stacks import allow_reading
 
 MiddlewareFactory = Callable[[Sequence[NodeFile], Callable[[BaseException], None]], Middleware]
 Event = Callable[[], None]
 
 _REPORT_S = 1.0
+_DRAIN_S = 5.0
 
 
 class NodeProcess:
@@ -46,6 +49,8 @@ class NodeProcess:
         connect: connects to the supervisor; the current folder is the run folder by then.
         open_recorder: where a node puts what is recorded; ``None``: nothing is.
         duration_sim_s: simulated time after which the node that owns it ends the project.
+        duration_s: virtual time after which the project ends.
+        real_time_factor: seconds of virtual time per second of the machine, at most.
         is_held: whether nodes stand still from the start, for a session.
         own_logs: whether each node writes to a log file of its own (several nodes share the
             process), rather than to the output that the process was started with.
@@ -59,10 +64,14 @@ class NodeProcess:
         *,
         open_recorder: Callable[[NodeFile], PacketRecorder] | None = None,
         duration_sim_s: float | None = None,
+        duration_s: float | None = None,
+        real_time_factor: float | None = None,
         is_held: bool = False,
         own_logs: bool = False,
     ) -> None:
         self._files = files
+        self._duration_s = duration_s
+        self._real_time_factor = real_time_factor
         self._make_middleware = make_middleware
         self._connect = connect
         self._open_recorder = open_recorder
@@ -253,6 +262,7 @@ class NodeProcess:
                 loop.post_loop_back(lambda: self._reset(asked))
                 return
             self._has_been_reset = True
+            self._middleware.begin_anew(self._files, asked.variables)
             for node in self._nodes:
                 try:
                     node.reset(asked.variables.get(node.name, {}), asked.keep.get(node.name, ()))
@@ -326,11 +336,18 @@ class NodeProcess:
 
     def _open_middleware(self) -> Middleware:
         middleware = self._make_middleware(self._files, self._fail_outside_hooks)
+        if self._files[0].time == VIRTUAL:
+            loop = cast(VirtualRun, middleware.loop)
+            loop.plan(self._duration_s, self._end_by_duration, self._real_time_factor)
         with self._early_lock:
             self._middleware = middleware
             for event in self._early_events:
                 middleware.loop.post_from_thread(event)
         return middleware
+
+    def _end_by_duration(self) -> None:
+        reason = f"{self._duration_s:g} s of virtual time have passed"
+        self._tell(control.Shutdown("", reason, _DRAIN_S))
 
     @property
     def is_ending(self) -> bool:

@@ -18,6 +18,7 @@ from neuros.node.simulated_time import SimulatedTime
 from neuros.ports import Logger, Middleware, Transport, WorldLook
 from neuros.project.model import Connection, NodeFile
 from neuros.project.names import SESSION
+from neuros.project.timing import VIRTUAL
 from neuros.stacks import LONG_S, Stack, stack_in
 
 _MAIN = threading.main_thread()
@@ -96,6 +97,7 @@ class NodeReports:
             "fault": self._fault,
             "compressed": self._transport.compressed,
             "is_driving": engine is not None and engine.is_driving,
+            "virtual_s": now_ns / 1e9 if self._file.time == VIRTUAL else None,
         }
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +23,7 @@ class SimulatedTime:
     Args:
         duration_s: when a node that owns time ends the project, ``None``: never.
         clock: monotonic clock in nanoseconds.
+        wall_ns: nanoseconds since 1970; in virtual time since time 0.
         on_over: called once with the duration when it has passed.
 
     Attributes:
@@ -36,6 +38,7 @@ class SimulatedTime:
         duration_s: float | None,
         clock: Callable[[], int],
         on_over: Callable[[float], None],
+        wall_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self.is_watched = node.owns_time
         self._is_owned = False
@@ -43,6 +46,7 @@ class SimulatedTime:
         self._duration_s = duration_s if node.owns_time else None
         self._has_told = False
         self._clock = clock
+        self._wall_ns = wall_ns
         self._on_over = on_over
         self._timeline = Timeline()
         self._read_s: Callable[[], float] | None = None
@@ -61,13 +65,17 @@ class SimulatedTime:
             return self._read_s()
         return None if self.clock.now_ns is None else self.clock.now_ns / 1e9
 
-    def stamp(self, wall_ns: Callable[[], int]) -> Any:
-        """A stamp of now: simulated where the node owns time or has a clock, else wall time."""
+    def stamp(self, reading: Callable[[int], int]) -> Any:
+        """A stamp of now: simulated where the node owns time or has a clock, else wall time.
+
+        Args:
+            reading: what is read of the wall clock, by what it says (:meth:`Engine.reading`).
+        """
         if self._read_s is not None:
             return to_stamp(self._read_s())
         if self._has_clock or self.is_watched:
             return to_stamp(nanoseconds=self.clock.now_ns or 0)
-        return to_stamp(nanoseconds=wall_ns())
+        return to_stamp(nanoseconds=reading(self._wall_ns()))
 
     def begin_anew(self, *, keeps_owner: bool) -> None:
         """The node was reset; ``keeps_owner``: the simulator that has the time goes on."""

@@ -20,10 +20,11 @@ from neuros.project.dashboard import dashboard_mistakes
 from neuros.project.message_types import array_type, normalised, with_copies
 from neuros.project.model import CLOCK_TYPE, Connection, Node
 from neuros.project.names import INTERNAL, MOST_CHARACTERS
-from neuros.project.parsed import ENDS, ParsedProject, names_of, rules_of
-from neuros.project.plugin_files import PluginHook, Remark, plugins_of, read_plugin
+from neuros.project.parsed import ENDS, ParsedProject, connection_name, names_of, rules_of
+from neuros.project.plugin_files import PluginFile, PluginHook, Remark, plugins_of, read_plugin
 from neuros.project.scanner import Element
 from neuros.project.suggest import did_you_mean
+from neuros.project.timing import LEAST_DELAY_NS, VIRTUAL, Distribution
 from neuros.project.validate import MOST_PROBLEMS
 
 Side = Literal["inputs", "outputs"]
@@ -58,7 +59,8 @@ _KNOWN_PREFIXES = (
 
 def mistakes(parsed: ParsedProject) -> list[Problem]:
     """All parts that do not fit together, at most ``MOST_PROBLEMS`` from each check."""
-    checks = (_nodes, _ports, _copies, _connections, dashboard_mistakes, _names, _parameters)
+    parts = (_nodes, _ports, _copies, _connections, dashboard_mistakes)
+    checks = (*parts, _names, _parameters, _timing)
     return [problem for check in checks for problem in islice(check(parsed), MOST_PROBLEMS)]
 
 
@@ -139,11 +141,10 @@ def _connections(parsed: ParsedProject) -> Iterator[Problem]:
     first: dict[str, Element] = {}
     are_all_known = True
     for connection in parsed.connections:
-        source, output, destination, input_ = (connection.string(end) for end in ENDS)
-        if None in (source, output, destination, input_):
+        name = connection_name(connection)
+        if not name:
             are_all_known = False
             continue
-        name = f"{source}.{output} -> {destination}.{input_}"
         if first.setdefault(name, connection) is not connection:
             yield connection.problem(f"the connection {name} occurs twice", _where(first[name]))
     budgets = parsed.root.member("budgets")
@@ -332,6 +333,51 @@ def _group_mistakes(
                 yield each.problem("is too large for an integer of ROS, which has 64 bits")
 
 
+# ---------------------------------------------------------------------- virtual time
+
+
+def _timing(parsed: ParsedProject) -> Iterator[Problem]:
+    """Impossible durations, delays and losses; in virtual time, inputs from outside."""
+    for node in parsed.nodes:
+        for duration in node.members("durations").values():
+            yield from _impossible(duration)
+    for connection in parsed.connections:
+        delay, loss = connection.member("delay"), connection.member("loss")
+        if delay is not None:
+            yield from _impossible(delay, LEAST_DELAY_NS)
+        is_to_itself = connection.string(ENDS[0]) == connection.string(ENDS[2])
+        for key, member in (("delay", delay), ("loss", loss)):
+            if member is not None and is_to_itself:
+                text = "packets of a node to itself are not sent, so they have no"
+                yield member.key_problem(f"{text} {key}", "leave it out")
+        if loss is not None and loss.value and connection.member("discard_limit") is not None:
+            text = "a connection with a discard limit loses no packet on its way"
+            hint = "leave out the discard_limit: then packets may be lost"
+            yield loss.key_problem(text, hint)
+    for node in parsed.nodes if parsed.root.string("time") == VIRTUAL else ():
+        for port in node.items("inputs"):
+            topic = port.member("external_topic")
+            if topic is not None:
+                text = "packets of an external topic arrive in real time, not in virtual time"
+                hint = "connect the input to a node, or run in real time"
+                yield topic.key_problem(text, hint)
+
+
+def _impossible(duration: Element, least_ns: int = 0) -> Iterator[Problem]:
+    """A range without values, and values below the least one; those of a normal curve are cut."""
+    try:
+        distribution = Distribution.of(duration.plain)
+    except (ValueError, TypeError, AttributeError):
+        return  # the schema reports it
+    low, high = distribution.values[0], distribution.values[-1]
+    if distribution.kind == "uniform" and low > high:
+        text, hint = "the least value is above the largest", f"write [{high:g}, {low:g}]"
+        yield duration.value["uniform"].problem(text, hint)
+    if distribution.kind not in ("normal", "lognormal") and distribution.least_ns < least_ns:
+        text = f"is at least {least_ns / 1000:g} microsecond"
+        yield duration.problem(f"a delay {text}, but may be {distribution.least_ns / 1e9:g} s")
+
+
 # ---------------------------------------------------------------------- Gazebo, of NeuROS 1.0
 
 
@@ -392,22 +438,44 @@ def plugin_problems(
         connections: ``None`` where not all of them are known.
     """
     problems, doubts = list[Problem](), list[Problem]()
+    is_virtual = parsed.root.string("time") == VIRTUAL
     for node, element in zip(nodes, parsed.nodes, strict=True):
-        for plugin in plugins_of(node):
+        plugins = plugins_of(node)
+        problems += _wrong_durations(node, element, plugins)
+        for plugin in plugins:
             found = [*plugin.mistakes]
             lists = (getattr(element.member(side), "value", []) for side in ("inputs", "outputs"))
             if all(isinstance(each, list) for each in lists):
                 for hook in plugin.hooks:
-                    found += _misfits(hook, node, connections)
+                    found += _misfits(hook, node, connections, is_virtual)
             problems += [remark.in_file(plugin.path) for remark in found]
             doubts += [remark.in_file(plugin.path) for remark in plugin.doubts]
     return problems, doubts
 
 
+def _wrong_durations(
+    node: Node, element: Element, plugins: Sequence[PluginFile]
+) -> Iterator[Problem]:
+    """Durations of hooks that the node does not have, or that take no time."""
+    kinds = {hook.name: hook.kind for plugin in plugins for hook in plugin.hooks}
+    is_whole = plugins and all(plugin.is_whole and not plugin.functions_of for plugin in plugins)
+    for name, duration in element.members("durations").items():
+        text, hint = node.no_duration(name, kinds if is_whole or name in kinds else None)
+        if text:
+            yield duration.key_problem(text, hint)
+
+
 def _misfits(
-    hook: PluginHook, node: Node, connections: Sequence[Connection] | None
+    hook: PluginHook, node: Node, connections: Sequence[Connection] | None, is_virtual: bool
 ) -> Iterator[Remark]:
-    """Ports of a hook that its node does not have, and required inputs without a connection."""
+    """Ports of a hook that its node lacks, required inputs without a connection, endless loops."""
+    is_main_loop = (
+        hook.kind == "neuros_function"
+        and hook.inputs is not None
+        and all(port.is_optional for port in hook.inputs)
+    )
+    if is_virtual and is_main_loop and node.is_timeless(hook.name):
+        yield Remark(*hook.place, *node.timeless(hook.name))
     if hook.sim_tick is not None:
         text, hint = node.no_clock
         if node.clock is not None:

@@ -40,6 +40,7 @@ from neuros.project.model import (
     Project,
     Resources,
     access_of,
+    durations_of,
     parameters_of,
     resources_of,
 )
@@ -48,6 +49,7 @@ from neuros.project.parsed import (
     apply_namespace,
     apply_override,
     apply_remaps,
+    apply_time,
     names_of,
     parse_project,
 )
@@ -56,7 +58,8 @@ from neuros.project.plugin_files import file_of
 from neuros.project.qos import qos_of
 from neuros.project.scanner import Element, SourceError, display_name
 from neuros.project.suggest import did_you_mean
-from neuros.project.validate import violations
+from neuros.project.timing import REAL
+from neuros.project.validate import apply_timing, violations
 
 STANDARD_CONTAINERS = frozenset(
     {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow", "neuros_nir"}
@@ -131,6 +134,7 @@ class _Builder:
             finalise_s=_if_valid(lambda: float(keys.get("finalise_s", FINALISE_S)), FINALISE_S),
             hooks=hooks,
             copies=copies_of(element),
+            durations=_if_valid(lambda: durations_of(keys.get("durations", {})), {}),
         )
 
     def _hooks(self, element: Element) -> tuple[Callable[..., Any], ...]:
@@ -234,6 +238,8 @@ def load_project(
     packages: MessagePackages = NO_PACKAGES,
     namespace: str | None = None,
     remap: Sequence[str] = (),
+    time: str | None = None,
+    timing: Path | None = None,
     reads_plugins: bool = False,
 ) -> LoadedProject:
     """Load and check a project.
@@ -247,6 +253,8 @@ def load_project(
         packages: message packages of workspaces.
         namespace: the text of ``--namespace``; it replaces the project's own.
         remap: the texts of ``--remap``; they come before the project's own rules.
+        time: the clock that replaces the project's own, ``real`` or ``virtual``.
+        timing: a file with durations and delays, which replace those of the project.
         reads_plugins: whether to check the sources of plugins, too.
 
     Raises:
@@ -270,6 +278,9 @@ def load_project(
     if namespace is not None:
         apply_namespace(parsed, namespace)
     parsed.problems += apply_remaps(parsed, remap)
+    apply_time(parsed, time)
+    if timing is not None:
+        parsed.problems += apply_timing(parsed, timing)
     builder = _Builder(parsed)
     names = names_of(parsed)
     nodes = tuple(builder.node(element) for element in parsed.nodes)
@@ -300,6 +311,7 @@ def load_project(
         budgets=Budgets(**{**budgets, "lost_packets": lost}),
         names=names,
         dashboard=dashboard_of(parsed),
+        time=parsed.root.string("time") or REAL,
     )
     loose = [*unconnected_ports(parsed)]
     told = (*sorted([*remarks(parsed), *loose]), *doubts)

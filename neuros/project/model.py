@@ -16,6 +16,8 @@ from typing import Any, TypeAlias
 from neuros.project.message_types import ArrayType, array_type, ros_type
 from neuros.project.names import INTERNAL, Names
 from neuros.project.qos import Qos
+from neuros.project.suggest import did_you_mean
+from neuros.project.timing import REAL, VIRTUAL, Distribution
 
 Value: TypeAlias = "bool | int | float | str | tuple[bool | int | float | str, ...]"
 """The value of a ROS parameter."""
@@ -27,6 +29,9 @@ NETWORK = "NETWORK"
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _NO_NAMES = Names()
 _KEYS_OF_TRANSPORT = ("compression", "quality")
+_WHOLE_NUMBERS = ("discard_limit", "queue_size", "quality")
+DEFAULT_DELAY = Distribution("constant", (0.0001,))
+"""Of packets and acknowledgements in virtual time."""
 FINALISE_S = 5.0
 MODEL_FIELDS = "NEUROS_MODEL_FIELDS"
 """A variable of nodes with a simulator: fields of its model, by name, as a JSON object."""
@@ -119,6 +124,7 @@ class Node:
         finalise_s: seconds of finalisation without progress after which the node is killed.
         hooks: functions of this program that are the plugin; empty if it is a file. JSON has none.
         copies: how many worlds each hook serves at once, ``None``: one, without an axis of copies.
+        durations: by hook, how long it takes in virtual time.
     """
 
     name: str
@@ -139,6 +145,7 @@ class Node:
     finalise_s: float = FINALISE_S
     hooks: tuple[Callable[..., Any], ...] = ()
     copies: int | None = None
+    durations: Mapping[str, Distribution] = field(default_factory=lambda: _NOTHING, hash=False)
 
     def input(self, name: str) -> Port:
         """The input of that name; raises ``KeyError``."""
@@ -172,6 +179,31 @@ class Node:
             clocks = [port for port in clocks if port.name == "clock"]
         return clocks[0] if clocks else None
 
+    def no_duration(self, hook: str, kinds: Mapping[str, str] | None) -> tuple[str, str]:
+        """Why a hook has no duration, and a hint; empty if it may have one.
+
+        ``kinds``: by name of each hook, its decorator; ``None``: not known.
+        """
+        kind = (kinds or {}).get(hook, "")
+        if kinds is not None and hook not in kinds:
+            hint = did_you_mean(hook, kinds) or f"it has {', '.join(kinds) or 'none'}"
+            return f"node '{self.name}' has no hook '{hook}'", hint
+        if kind and kind not in ("neuros_tick", "neuros_function"):
+            text = f"hook '{hook}' is a {kind}: only tick and function hooks take time"
+            return text, "leave it out"
+        return "", ""
+
+    def is_timeless(self, hook: str) -> bool:
+        """Whether no execution of a hook takes virtual time, whatever it does."""
+        duration = self.durations.get(hook)
+        return not self.owns_time if duration is None else not any(duration.values)
+
+    def timeless(self, hook: str) -> tuple[str, str]:
+        """The error of a hook that starts unasked and takes no virtual time, and a hint."""
+        text = f"hook '{hook}' of node '{self.name}' starts unasked, and takes no virtual time"
+        cure = f'"durations": {{"{hook}": 0.01}}'
+        return text, f"give the node {cure}, in seconds, or the hook an input that it requires"
+
     def misfit(self, is_batch: bool, has_ports: bool) -> tuple[str, str]:
         """Why a hook does not fit the number of copies, and a hint; empty if it does."""
         if is_batch and self.copies is None:
@@ -204,6 +236,8 @@ class Connection:
         namespace: that of the project, empty or as in ``/left``.
         compression: ``zstd`` (of packets that leave the machine), ``jpeg`` or ``None``.
         quality: of JPEG, 1 to 100.
+        delay: how long a packet, or an acknowledgement, is under way in virtual time.
+        loss: the probability that a packet is lost on its way in virtual time.
     """
 
     source_node: str
@@ -216,6 +250,8 @@ class Connection:
     namespace: str = ""
     compression: str | None = None
     quality: int = 95
+    delay: Distribution = DEFAULT_DELAY
+    loss: float = 0.0
 
     @property
     def is_reliable(self) -> bool:
@@ -250,8 +286,10 @@ class Connection:
         """The connection of valid keys; JSON may write a whole number as ``2.0``."""
         flat = {**keys, **keys.get("transport", {})}
         flat.pop("transport", None)
-        whole: dict[str, Any] = {k: int(v) if isinstance(v, float) else v for k, v in flat.items()}
-        return cls(**whole, **more)
+        flat |= {key: int(flat[key]) for key in _WHOLE_NUMBERS if key in flat}
+        if "delay" in flat:
+            flat["delay"] = Distribution.of(flat["delay"])
+        return cls(**flat, **more)
 
     @property
     def keys(self) -> dict[str, Any]:
@@ -259,6 +297,8 @@ class Connection:
         values = {f.name: (getattr(self, f.name), f.default) for f in fields(self)}
         del values["index"], values["namespace"]
         keys = {key: value for key, (value, default) in values.items() if value != default}
+        if "delay" in keys:
+            keys["delay"] = self.delay.keys
         transport = {key: keys.pop(key) for key in _KEYS_OF_TRANSPORT if key in keys}
         return {**keys, "transport": transport} if transport else keys
 
@@ -292,6 +332,8 @@ class NodeFile:
         names: the project's.
         list_bytes: limit of each list of the packet log; 0: the node keeps no log.
         restored: by name of a value that its plugin keeps, the file that it came from.
+        time: the clock of the run, ``real`` or ``virtual``.
+        seed: from which durations, delays and losses are drawn in virtual time.
     """
 
     node: Node
@@ -302,6 +344,8 @@ class NodeFile:
     names: Names = _NO_NAMES
     list_bytes: int = 64_000_000
     restored: Mapping[str, str] = field(default_factory=lambda: _NOTHING, hash=False)
+    time: str = REAL
+    seed: str = ""
 
     @property
     def logger_name(self) -> str:
@@ -330,6 +374,7 @@ class Project:
 
     Attributes:
         dashboard: the layout of the dashboard in the file, ``None`` if it has none.
+        time: the clock of a run, ``real`` or ``virtual``.
     """
 
     name: str
@@ -340,6 +385,12 @@ class Project:
     budgets: Budgets = Budgets()
     names: Names = _NO_NAMES
     dashboard: Mapping[str, Any] | None = field(default=None, hash=False)
+    time: str = REAL
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether declared times alone move the clock of a run on."""
+        return self.time == VIRTUAL
 
     @property
     def folder(self) -> Path:
@@ -419,6 +470,11 @@ def parameters_of(written: Mapping[str, Any]) -> dict[str, Value]:
         else:
             found[name] = value
     return found
+
+
+def durations_of(written: Mapping[str, Any]) -> dict[str, Distribution]:
+    """By hook, its duration in virtual time, from valid values."""
+    return {hook: Distribution.of(value) for hook, value in written.items()}
 
 
 def parameters_to_json(parameters: Mapping[str, Value]) -> dict[str, Any]:

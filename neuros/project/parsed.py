@@ -252,6 +252,19 @@ def apply_namespace(parsed: ParsedProject, text: str) -> None:
         parsed.root.value["namespace"] = Element(text, source, 0, len(text), "/namespace")
 
 
+def connection_name(connection: Element) -> str:
+    """The name of a connection, as messages show it; empty if an end is missing."""
+    ends = [connection.string(end) for end in ENDS]
+    return "" if None in ends else "{}.{} -> {}.{}".format(*ends)
+
+
+def apply_time(parsed: ParsedProject, time: str | None) -> None:
+    """Replace the clock of a parsed project by that of ``--time``."""
+    if time is not None and isinstance(parsed.root.value, dict):
+        source = Source(f"--time {time}", parsed.roots.project, time)
+        parsed.root.value["time"] = Element(time, source, 0, len(time), "/time")
+
+
 def apply_remaps(parsed: ParsedProject, texts: Sequence[str]) -> list[Problem]:
     """Put the rules of ``--remap`` before those of a parsed project."""
     problems: list[Problem] = []

@@ -19,6 +19,7 @@ from neuros.project.model import (
     Port,
     Project,
     access_of,
+    durations_of,
     keys_of,
     parameters_of,
     parameters_to_json,
@@ -27,10 +28,12 @@ from neuros.project.model import (
 from neuros.project.names import names_from, names_to_json
 from neuros.project.paths import find_module, is_module_name
 from neuros.project.qos import qos_of, qos_to_json
+from neuros.project.timing import REAL, seed_of
 
 
 def split(project: Project, folders_for: Callable[[Node], Folders]) -> tuple[NodeFile, ...]:
     """Cut a project into one part per node, in the order of the nodes."""
+    seed = seed_of(project.nodes) if project.is_virtual else ""
     return tuple(
         NodeFile(
             node=node,
@@ -42,6 +45,8 @@ def split(project: Project, folders_for: Callable[[Node], Folders]) -> tuple[Nod
             folders=folders_for(node),
             index=index,
             names=project.names,
+            time=project.time,
+            seed=seed,
         )
         for index, node in enumerate(project.nodes)
     )
@@ -63,6 +68,7 @@ def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
         "file": str(node.file),
         "pointer": node.pointer,
         "environment_paths": list(node.environment_paths),
+        **({"time": node_file.time, "seed": node_file.seed} if node_file.time != REAL else {}),
         **names_to_json(node_file.names),
     }
 
@@ -97,6 +103,7 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
             parameters=parameters_of(node.get("parameters", {})),
             finalise_s=node.get("finalise_s", FINALISE_S),
             copies=copies,
+            durations=durations_of(node.get("durations", {})),
         ),
         connections=tuple(
             Connection.of(keys, namespace=names.namespace) for keys in content["connections"]
@@ -106,6 +113,8 @@ def node_file_from_json(content: Mapping[str, Any]) -> NodeFile:
         messages=tuple(map(Path, content.get("messages", ()))),
         names=names,
         restored=content.get("restored", {}),
+        time=content.get("time", REAL),
+        seed=content.get("seed", ""),
         **({"list_bytes": content["list_bytes"]} if "list_bytes" in content else {}),
     )
 
@@ -139,6 +148,8 @@ def project_to_json(project: Project) -> dict[str, Any]:
     ]
     content["connections"] = [connection.keys for connection in project.connections]
     content |= names_to_json(project.names)
+    if project.is_virtual:
+        content["time"] = project.time
     if budgets := budgets_to_json(project.budgets):
         content["budgets"] = budgets
     if project.dashboard is not None:
@@ -176,6 +187,7 @@ def _node_keys(node: Node) -> dict[str, Any]:
         "parameters": parameters_to_json(node.parameters),
         "finalise_s": 0 if node.finalise_s == FINALISE_S else node.finalise_s,
         "copies": node.copies,
+        "durations": {hook: duration.keys for hook, duration in node.durations.items()},
     }
     return {
         "name": node.name,

@@ -10,6 +10,7 @@ import json
 import math
 import re
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -17,9 +18,10 @@ from typing import Any
 
 from neuros.errors import Problem
 from neuros.project.model import Project
-from neuros.project.parsed import ParsedProject
-from neuros.project.scanner import Element, problem_in
+from neuros.project.parsed import ParsedProject, connection_name
+from neuros.project.scanner import Element, SourceError, problem_in, read_file
 from neuros.project.suggest import did_you_mean, listed
+from neuros.project.timing import VIRTUAL
 
 MOST_PROBLEMS = 200
 """Of one check: nobody reads more, and a search for all can take minutes."""
@@ -82,9 +84,43 @@ def nest_conflicts(project: Project, names: Collection[str] | None = None) -> tu
     )
 
 
-def violations_in(element: Element, name: str) -> list[Problem]:
-    """The violations of the schema of that name in a document."""
-    errors = _validator(name).iter_errors(element.plain)
+def apply_timing(parsed: ParsedProject, file: Path) -> list[Problem]:
+    """Replace durations and delays of a parsed project by those of a file (``--timing``).
+
+    Returns the mistakes in the file.
+    """
+    try:
+        timing, problems = read_file(file)
+    except SourceError as error:
+        return [error.problem]
+    if found := violations_in(timing, "project", "#/$defs/timing"):
+        return [*problems, *found]
+    if parsed.root.string("time") != VIRTUAL:
+        text = "durations and delays have an effect in virtual time only"
+        problems.append(timing.problem(text, "add --time virtual"))
+    nodes = {node.string("name") or "": node for node in parsed.nodes}
+    for name, duration in timing.members("hooks").items():
+        node, _, hook = name.partition(".")
+        if node in nodes and hook:
+            old = nodes[node].members("durations")
+            where = nodes[node].value.get("durations", duration)
+            nodes[node].value["durations"] = replace(where, value={**old, hook: duration})
+        elif parsed.is_complete:
+            hint = did_you_mean(node, nodes) if hook else "write 'node.hook'"
+            problems.append(duration.key_problem(f"there is no node for '{name}'", hint))
+    connections = {connection_name(c): c for c in parsed.connections}
+    for name, delay in timing.members("connections").items():
+        if name in connections:
+            connections[name].value["delay"] = delay
+        else:
+            hint = did_you_mean(name, connections) or "write 'a.out -> b.in'"
+            problems.append(delay.key_problem(f"there is no connection '{name}'", hint))
+    return problems
+
+
+def violations_in(element: Element, name: str, part: str = "") -> list[Problem]:
+    """The violations of the schema of that name, or of a part of it, in a document."""
+    errors = _validator(name, part).iter_errors(element.plain)
     found = (problem for error in errors for problem in _sentences(error, element))
     return [*islice(found, MOST_PROBLEMS)]
 
@@ -176,6 +212,8 @@ def _sentence(error: Any) -> tuple[str, str]:
     if error.validator == "required":
         missing = next(key for key in expected if key not in found)
         return f"the key '{missing}' is missing", ""
+    if error.validator in ("minProperties", "maxProperties") and "properties" in error.schema:
+        return "needs exactly one of " + listed(error.schema["properties"]), ""
     numbers = {
         "minimum": f"must be at least {expected}, but is {found}",
         "exclusiveMinimum": f"must be more than {expected}, but is {found}",

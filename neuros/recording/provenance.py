@@ -16,6 +16,7 @@ from typing import Any
 from neuros.distribution import __version__
 from neuros.project.model import Node
 from neuros.project.scanner import read_bytes
+from neuros.project.timing import seeds
 
 _GIT_PATIENCE_S = 5.0
 _VERSIONS = "versions.json"
@@ -93,15 +94,6 @@ def machine() -> dict[str, Any]:
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
         "system": _first("/etc/os-release", "PRETTY_NAME"),
     }
-
-
-def seeds(nodes: Iterable[Node]) -> dict[str, dict[str, str]]:
-    """By node, the variables of its environment with SEED in their names."""
-    found = {
-        node.name: {key: value for key, value in node.environment.items() if "SEED" in key.upper()}
-        for node in nodes
-    }
-    return {name: variables for name, variables in found.items() if variables}
 
 
 class GitState:

@@ -22,9 +22,10 @@ from dataclasses import replace
 from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neuros.ports import Inbox, Logger, Transport, TransportKind, Voice
+from neuros.ports import Inbox, Logger, NodeEvents, Transport, TransportKind, Voice
 from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.project.names import SESSION
+from neuros.project.timing import VIRTUAL
 from neuros.transport.imports_when_used import imports_when_used
 from neuros.transport.memory import GraphBridge, MemoryHub, MemoryTransport
 from neuros.transport.messages import RosPackets
@@ -53,13 +54,14 @@ class LocalLoop:
         clock: monotonic clock in nanoseconds.
 
     Attributes:
+        clock: that clock.
         post: handle an event after all waiting events.
         ros: the loop of ROS, once there is one; see :meth:`serve`.
         interruption: raised before the next event; see :meth:`interrupt`.
     """
 
     def __init__(self, clock: Callable[[], int] = time.monotonic_ns) -> None:
-        self._clock = clock
+        self.clock = clock
         self._events: deque[Event] = deque()
         self.post: Callable[[Event], None] = self._events.append
         self.post_loop_back = self.post
@@ -108,7 +110,7 @@ class LocalLoop:
 
     def run_due_timers(self) -> None:
         """Call the timers that are due."""
-        now_ns = self._clock()
+        now_ns = self.clock()
         for next_due_ns, on_due in self._timers:
             due_ns = next_due_ns()
             if due_ns is not None and due_ns <= now_ns:
@@ -150,9 +152,9 @@ class LocalLoop:
         Raises:
             BaseException: the :attr:`interruption`; the events that wait are kept.
         """
-        self._end_ns = self._clock() + round(seconds * 1e9)
+        self._end_ns = self.clock() + round(seconds * 1e9)
         ros_due_ns = 0
-        while (now_ns := self._clock()) < self._end_ns:
+        while (now_ns := self.clock()) < self._end_ns:
             if self.interruption is not None:
                 self._raise_interruption()
             if self.ros is not None and now_ns >= ros_due_ns:
@@ -211,7 +213,7 @@ class LocalLoop:
         """Handle the oldest event, or wait for one; then the timers that are due."""
         if not self.step():
             times = [ns for ns in (self.next_due_ns, end_ns) if ns is not None]
-            left_s = max(0.0, (min(times) - self._clock()) / 1e9) if times else None
+            left_s = max(0.0, (min(times) - self.clock()) / 1e9) if times else None
             self.wait(left_s)
         if self._timers:
             self.run_due_timers()
@@ -452,11 +454,20 @@ class LocalMiddleware:
         self._ros_nodes[file.node.name] = (
             self.local_ros_node(file, self._logger(file)) if is_local else self._ros_node(file)
         )
-        transport = MemoryTransport(
-            file, self.hub, self.bridge(file), self._digest, self._digests_of
-        )
+        transport = self._memory_transport(file)
         self._transports.append(transport)
         return transport
+
+    def _memory_transport(self, file: NodeFile) -> Transport:
+        return MemoryTransport(file, self.hub, self.bridge(file), self._digest, self._digests_of)
+
+    def loop_of(self, file: NodeFile) -> NodeEvents:
+        return self.loop
+
+    def begin_anew(
+        self, files: Sequence[NodeFile], variables: Mapping[str, Mapping[str, str]]
+    ) -> None:
+        """Nothing: real time goes on, and is drawn from no seed."""
 
     def local_ros_node(self, file: NodeFile, logger: Logger) -> LocalRosNode:
         """What a plugin gets as its ROS node."""
@@ -571,17 +582,20 @@ class _OneProcess(TransportKind):
         do_without_code_generator()
         is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
         tried = TriedDigest() if is_lossless and not record else None
-        return LocalMiddleware(
-            None if self._has_ros else LocalLoop(),
-            None,
-            on_failure,
-            files=files,
-            exposes=self._has_ros,
-            debug=debug,
-            digest=digest_of if digests or record else tried,
+        keywords: dict[str, Any] = {
+            "files": files,
+            "exposes": self._has_ros,
+            "debug": debug,
+            "digest": digest_of if digests or record else tried,
             # Of what is recorded, digests only tell which packets have arrived.
-            digests_of=lambda c: digests or not (record and c.is_reliable),
-        )
+            "digests_of": lambda c: digests or not (record and c.is_reliable),
+        }
+        if files[0].time == VIRTUAL:
+            from neuros.runtime.virtual import VirtualLoop, VirtualMiddleware
+
+            loop = VirtualLoop(files[0].seed)
+            return VirtualMiddleware(loop, None, on_failure, **keywords | {"digest": digest_of})
+        return LocalMiddleware(None if self._has_ros else LocalLoop(), None, on_failure, **keywords)
 
 
 MEMORY = _OneProcess("memory", has_ros=True)

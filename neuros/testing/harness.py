@@ -339,7 +339,6 @@ class PluginHarness:
                 fail=self._fail,
                 log_file=None,
                 duration_sim_s=None,
-                clock=self._clock,
             )
             self._runtime.load()
         self._loop.post(self._runtime.start)

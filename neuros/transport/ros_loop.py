@@ -77,6 +77,7 @@ class RosLoop:
     """
 
     def __init__(self, context: Context, on_failure: Callable[[BaseException], None]) -> None:
+        self.clock = time.monotonic_ns
         self._executor = make_executor(context, on_failure)
         self._on_failure = on_failure
         self._waker = _Waker()

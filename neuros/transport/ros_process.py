@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import rclpy
@@ -23,7 +23,7 @@ from rclpy.qos import (
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
-from neuros.ports import Transport, TransportKind
+from neuros.ports import NodeEvents, Transport, TransportKind
 from neuros.project.model import NodeFile
 from neuros.project.names import INTERNAL
 from neuros.transport.dds_profile import dds_environment
@@ -102,6 +102,14 @@ class RosProcess:
             self._ros_nodes[name] = lean_node(file, self._context)
             self.loop.add_node(self._ros_nodes[name])
         return self._ros_nodes[name]
+
+    def loop_of(self, file: NodeFile) -> NodeEvents:
+        return self.loop
+
+    def begin_anew(
+        self, files: Sequence[NodeFile], variables: Mapping[str, Mapping[str, str]]
+    ) -> None:
+        """Nothing: real time goes on, and is drawn from no seed."""
 
     def has_node(self, file: NodeFile) -> bool:
         """Whether the ROS node of a node has been made."""

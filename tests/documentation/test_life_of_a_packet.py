@@ -100,7 +100,6 @@ class TwoNodes:
                     fail=lambda _, error: self.failures.append(error),
                     log_file=None,
                     duration_sim_s=None,
-                    clock=ManualClock(),
                 )
             )
         for each in self.nodes:

@@ -68,6 +68,7 @@ BY_NAME = {
         "integration/",
         "runtime/test_local_loop.py::test_a_free_run_serves_ros",
         "runtime/test_local_loop.py::test_events_timers_and_threads",
+        "runtime/test_virtual_time.py",
         "upgrades/test_upgrades.py",
     ),
     "process": (

@@ -152,6 +152,8 @@ class SimulatedNode:
             self.failures.append(error)
             self.changed.notify_all()
 
+    virtual_time = None
+
     def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
         with self.changed:
             self.is_waiting = not self.is_active

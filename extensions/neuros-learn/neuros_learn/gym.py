@@ -29,7 +29,7 @@ from neuros.errors import EnvironmentFault, UsageError
 from neuros.project.model import SEEDS, Port
 from neuros.project.model import Project as Described
 from neuros.project.suggest import did_you_mean
-from neuros.recording.provenance import seeds
+from neuros.project.timing import seeds
 from neuros.transport.messages import message_class
 from neuros.transport.schema import NUMBERS, Leaf, Shape, Sort, getter, schema
 from neuros.visualise import image_pixels

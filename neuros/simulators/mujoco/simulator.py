@@ -164,6 +164,10 @@ class MuJoCo:
         self._refuse_while_running("run_asynchronous")
         if real_time_factor is not None and not 0 < real_time_factor < float("inf"):
             raise ModelError(f"real_time_factor is positive or None, not {real_time_factor!r}")
+        if real_time_factor is None and self._node.virtual_time is not None:
+            raise ModelError(
+                "run_asynchronous(None) takes no virtual time: give a real_time_factor, such as 1.0"
+            )
         self._world.require_bound()
         self._world.cameras.close()  # its OpenGL belongs to this thread, not to the new one
         steps = _BOUT_STEPS

@@ -10,8 +10,9 @@ import threading
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from fractions import Fraction
+from functools import partial
 
-from neuros.ports import Advance, NodeContext
+from neuros.ports import Advance, NodeContext, Packet
 
 _LARGEST_DENOMINATOR = 1_000_000
 _TIMESTEP_TOLERANCE = Fraction(1, 10_000_000)
@@ -19,6 +20,7 @@ _PERIOD_TOLERANCE = Fraction(1, 1_000_000)
 _MAX_LAG_S = 0.5
 _JOIN_S = 5.0
 _IDLE_S = 0.1
+_PAUSED_S = 0.005
 
 
 class Timebase:
@@ -133,17 +135,22 @@ class Pacer:
 
     def hold(self, sim_time_s: float) -> None:
         """Wait until ``sim_time_s`` is due."""
+        early_s = self.early_s(sim_time_s)
+        if early_s > 0:
+            self._wait(early_s)
+
+    def early_s(self, sim_time_s: float) -> float:
+        """Seconds until ``sim_time_s`` is due; 0 if it is due, or the pacer never waits."""
         if self._factor is None:
-            return
+            return 0.0
         origin = self._origin  # read once: another thread may call restart
         if origin is None:
             self.start(sim_time_s)
-            return
+            return 0.0
         early_s = origin + sim_time_s / self._factor - self._clock()
-        if early_s > 0:
-            self._wait(early_s)
-        elif -early_s > self._max_lag_s:
+        if -early_s > self._max_lag_s:
             self._origin = origin - early_s - self._max_lag_s
+        return max(0.0, early_s)
 
 
 class StepLock:
@@ -224,7 +231,8 @@ class FreeRun:
 
     It begins at time 0 of the run, and ends when the simulated time of the run is over. Sending
     waits while a reliable connection is blocked; visitors of the lock may use model and data
-    meanwhile. An error ends the node. In a replay, the node advances the world without a thread.
+    meanwhile. An error ends the node. In virtual time there is no thread: events of the node do
+    this, at the times of the virtual clock. In a replay, the node advances the world where it did.
 
     Args:
         advance: runs one bout and returns the packets that are due after it, by output.
@@ -251,7 +259,10 @@ class FreeRun:
         self._advance, self._sim_time, self._finish = advance, sim_time, finish
         self._idle = idle
         self._stopped = threading.Event()
-        self._is_driven = False
+        self._is_driven = False  # by events of the node, so that there is no thread
+        self._virtual = node.virtual_time
+        if self._virtual is not None:
+            clock = self._virtual.clock_s
         self.pacer = Pacer(factor, clock, wait or self._stopped.wait)
         self._thread = threading.Thread(
             target=self._run, name=f"{node.name}: simulation", daemon=True
@@ -259,11 +270,14 @@ class FreeRun:
 
     @property
     def is_running(self) -> bool:
-        return (self._is_driven or self._thread.is_alive()) and not self._stopped.is_set()
+        is_alive = self._is_driven or self._thread.is_alive()
+        return is_alive and not self._stopped.is_set()
 
     def start(self) -> None:
-        self._is_driven = self._node.drive(self._advance)
-        if not self._is_driven:
+        self._is_driven = self._virtual is not None or self._node.drive(self._advance)
+        if self._virtual is not None:
+            self._virtual.when_active(self._start_in_virtual_time)
+        elif not self._is_driven:
             self._thread.start()
 
     def stop(self) -> None:
@@ -300,3 +314,33 @@ class FreeRun:
         self.pacer.hold(self._sim_time())
         may_go_on = not packets or self._node.submit(packets, cancelled)
         return may_go_on and self._node.note_simulated_time()
+
+    def _start_in_virtual_time(self) -> None:
+        self.pacer.start(self._sim_time())
+        self._bout_in_virtual_time()
+
+    def _bout_in_virtual_time(self) -> None:
+        """Run a bout; what is due after it leaves when the virtual clock has come that far."""
+        virtual = self._virtual
+        if virtual is None or self._stopped.is_set():
+            return
+        now_s = virtual.clock_s()
+        if self._lock.is_paused:
+            virtual.call_at(now_s + _PAUSED_S, self._bout_in_virtual_time)
+            return
+        with self._lock.visit():
+            packets = self._advance()
+        due_s = now_s + self.pacer.early_s(self._sim_time())
+        virtual.call_at(due_s, partial(self._send_in_virtual_time, packets))
+
+    def _send_in_virtual_time(self, packets: Mapping[str, Packet]) -> None:
+        if self._virtual is None or self._stopped.is_set():
+            return
+        if packets:
+            self._virtual.send(packets, self._go_on_in_virtual_time)
+        else:
+            self._go_on_in_virtual_time()
+
+    def _go_on_in_virtual_time(self) -> None:
+        if self._node.note_simulated_time():
+            self._bout_in_virtual_time()
