@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from neuros.api.changes import Changes, changes_of
+from neuros.api.changes import changes_of
 from neuros.api.live import PROGRAM_FAILED, why_it_ended
 from neuros.api.loading import seed_variables, value_text, with_model_fields
 from neuros.api.run import Run
@@ -40,6 +40,7 @@ from neuros.api.session_link import (
 from neuros.control import AtRest, NodeStatus
 from neuros.errors import NeurosError, RunError, UsageError
 from neuros.node.instruments import room_for
+from neuros.ports import Changes
 from neuros.project.graph import graph_svg
 from neuros.project.model import Node, Port, Project
 from neuros.project.repeatable import why_not_repeatable

@@ -228,6 +228,18 @@ def test_whatever_was_done_a_fork_does_then_what_the_session_does(
             assert play(other, after) == play(s, after)
 
 
+def test_in_virtual_time_a_session_that_ran_for_a_time_is_forked(tmp_path: Path) -> None:
+    project = described(tmp_path, limit=None)
+    times = {"nodes.grower.durations": {"grow": {"uniform": [0.01, 0.03]}}}
+    with project.session(time="virtual", set=times) as s:
+        s.run(duration_s=0.5)
+        with s.fork() as other:
+            assert other["grower.sum"].count == s["grower.sum"].count > 10
+            for each in (s, other):
+                each.run(duration_s=0.3)
+            assert other["doubler.twice"].packet == s["doubler.twice"].packet
+
+
 # ------------------------------------------------------------------ refused
 
 
