@@ -83,8 +83,9 @@ def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
     add = reproduce.add_argument
     add(
         "experiment",
-        choices=("whiskeye", "headdirection", "tick", "voting", "elevator"),
-        help="whiskeye: the robot in its seven orchestrations; headdirection: its eyes correct its"
+        choices=("whiskeye", "orchestrations", "headdirection", "tick", "voting", "elevator"),
+        help="whiskeye: the robot in its seven orchestrations; orchestrations: the same in virtual"
+        " time, accuracy against loss, latency and speed; headdirection: its eyes correct its"
         " heading; tick: how regular ticks are, compared with a timer of rclpy; voting: what"
         " NeuROS adds to three parallel tasks of 5 s; elevator: how fast a simulation is in three"
         " orchestrations",
@@ -95,7 +96,8 @@ def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="NAME",
         help="only these parts: tick_20ms, tick_60ms, tick_100ms, the same with _1ms behind it,"
-        " strict, no_discard_limit, asynchronous, hybrid (whiskeye); training, left, right,"
+        " strict, no_discard_limit, asynchronous, hybrid (whiskeye); these seven with .published,"
+        " .here, .15ms, .30ms, .60ms or .120ms behind them (orchestrations); training, left, right,"
         " left_biased, right_biased, left_biased_down (headdirection); neuros, rclpy (tick);"
         " strict, no_discard_limit, asynchronous (elevator)",
     )
@@ -103,8 +105,9 @@ def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
         "--duration",
         type=_seconds,
         metavar="SECONDS",
-        help="length of a run: in simulated seconds for whiskeye and headdirection, else in wall"
-        " seconds (default: 20 for whiskeye and elevator, 60 for the others)",
+        help="length of a run: in simulated seconds for whiskeye, orchestrations and"
+        " headdirection, else in wall seconds (default: 20 for whiskeye and elevator, 10 for"
+        " orchestrations, 60 for the others)",
     )
     add(
         "--weights",

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from neuros_analysis.charts import timeline_figure
 from neuros_analysis.review import open_for_review
-from neuros_analysis.run_pages import png
+from neuros_analysis.run_pages import picture
 
 import neuros
 
@@ -51,7 +51,7 @@ def draw(name: str, folder: Path) -> None:
     )
     figure = timeline_figure(open_for_review(folder))
     assert figure is not None
-    (FIGURES / f"swim_lanes_{name}.png").write_bytes(png(figure))
+    (FIGURES / f"swim_lanes_{name}.png").write_bytes(picture(figure))
 
 
 if __name__ == "__main__":

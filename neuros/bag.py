@@ -14,8 +14,11 @@
 from __future__ import annotations
 
 import os
+import shutil
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import cached_property
+from itertools import islice
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -23,20 +26,26 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import numpy.typing as npt
 from rosbags.interfaces import Connection, QosDurability, QosReliability
+from rosbags.typesys import Stores, get_typestore
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, UsageError
+from neuros.recording.bag_writer import BagWriter, define
 from neuros.recording.columns import LOG_TIME, PUBLISH_TIME, Column, columns_of
 from neuros.recording.recorder import lost_of, named, needs_repair, recorded_counts, repair
-from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, load_plan
+from neuros.recording.recording_plan import BAG_NAME, PLAN_NAME, Topic, is_named, load_plan
 from neuros.recording.stored import (
+    METADATA_NAME,
+    StoredBag,
     are_left,
-    contents_of,
+    bag_files,
     damage_of,
     faults_of,
-    store_of,
-    stored_messages,
 )
+from neuros.recording.topic_types import TopicType
 from neuros.registry import BAG_FORMATS
+
+_FEW_PACKETS = 5
+"""Of a topic, to find the definition of its type that fits."""
 
 __all__ = ["Bag", "RawPacket", "RecordedTopic", "open"]
 
@@ -62,6 +71,7 @@ class RecordedTopic:
 
     def __init__(self, bag: Bag, recorded: Connection, connection: str | None) -> None:
         self._bag = bag
+        self._recorded = recorded
         self.name = recorded.topic
         self.type = recorded.msgtype
         self.connection = connection
@@ -77,10 +87,46 @@ class RecordedTopic:
         """All packets, in the order of their wall time."""
         return self._bag.packets_of(self.name)
 
+    @cached_property
+    def definition(self) -> TopicType:
+        """How its packets are decoded.
+
+        Raises:
+            EnvironmentFault: if neither the bag nor this machine defines its type.
+        """
+        some = self._bag.first_packets(self.name, _FEW_PACKETS)
+        with damage_of(self._bag.folder, self.name):
+            try:
+                return TopicType(self._recorded, self._bag.distribution, some)
+            except EnvironmentFault as fault:
+                place = f"{self._bag.folder}: {self.name}"
+                raise EnvironmentFault(f"{place} cannot be decoded: {fault}") from fault
+
+    @property
+    def misfit(self) -> str:
+        """Why programs of this machine cannot read its packets, in a sentence; empty if they can.
+
+        Raises:
+            EnvironmentFault: if its type is not known at all.
+        """
+        how, here = self.definition, get_typestore(Stores.EMPTY)
+        try:
+            define(how.name, here)
+        except EnvironmentFault as fault:
+            return str(fault)
+        is_same = here.hash_rihs01(how.name) == how.store.hash_rihs01(how.name)
+        return "" if is_same else f"{how.name} has other fields in the bag than it has here"
+
+    def decode(self, data: bytes) -> Any:
+        """A message from a packet. Raises ``EnvironmentFault`` for other bytes."""
+        how = self.definition
+        with damage_of(self._bag.folder, f"a packet of type {self.type}"):
+            return how.store.deserialize_cdr(data, how.name)
+
     def messages(self) -> Iterator[tuple[RawPacket, Any]]:
         """Packets with their messages, which ``rosbags`` decodes one by one."""
         for packet in self.raw():
-            yield packet, self._bag.message(packet.data, self.type)
+            yield packet, self.decode(packet.data)
 
     def __iter__(self) -> Iterator[Any]:
         """The messages, in the order of their wall time."""
@@ -88,16 +134,16 @@ class RecordedTopic:
 
     def message(self, place: int) -> Any:
         """The message at a place, from 0. Raises ``IndexError``."""
-        return self._bag.message(self.raw()[place].data, self.type)
+        return self.decode(self.raw()[place].data)
 
     def columns(self) -> dict[str, Column]:
         """A column for each field, and the two times; see :meth:`array`."""
-        packets = self.raw()
+        packets, how = self.raw(), self.definition
         with damage_of(self._bag.folder, self.name):
             return {
                 LOG_TIME: np.array([p.log_time_ns for p in packets], np.int64),
                 PUBLISH_TIME: np.array([p.publish_time_ns for p in packets], np.int64),
-                **columns_of([p.data for p in packets], self.type, self._bag.store),
+                **columns_of([p.data for p in packets], how.name, how.store),
             }
 
     def array(self) -> npt.NDArray[Any]:
@@ -139,7 +185,9 @@ class RecordedTopic:
         Raises:
             UsageError: without the extension that makes datasets.
         """
-        return BAG_FORMATS.load("xarray")(self, self._bag.store.fielddefs, self._bag.start_ns)
+        known, name = self.definition.store.fielddefs, self.definition.name
+        types = {**known, self.type: known[name]}
+        return BAG_FORMATS.load("xarray")(self, types, self._bag.start_ns)
 
     def neo(self) -> Any:
         """A ``neo.Segment`` of recorded spikes (``neuros_msgs/msg/Spikes``).
@@ -177,6 +225,8 @@ class Bag:
         start_ns: wall time of the first packet, in nanoseconds since 1970.
         duration_s: from the first packet to the last.
         missing: by topic, how many packets the bag has lost since the run ended.
+        distribution: of ROS, as ``humble``, where the bag tells; empty where not.
+        notes: sentences about what is odd in the bag of another program, and no damage.
     """
 
     def __init__(
@@ -186,15 +236,15 @@ class Bag:
         recorded: Mapping[str, int] | None = None,
     ) -> None:
         self.folder = folder
-        contents = contents_of(folder)
-        with damage_of(folder):
-            self.custom = contents.custom
-            self.start_ns, self.duration_s = contents.start_ns, contents.duration_ns / 1e9
-            found = {c.topic: c for c in contents.connections}
-            self.store = store_of(found.values())
-            self.topics = {
-                name: RecordedTopic(self, c, connections.get(name)) for name, c in found.items()
-            }
+        self._stored = StoredBag(folder)
+        contents = self._stored.contents()
+        self.custom, self.distribution = contents.custom, contents.distribution
+        self.start_ns, self.duration_s = contents.start_ns, contents.duration_ns / 1e9
+        self.notes = contents.notes
+        self.topics = {
+            name: RecordedTopic(self, each, connections.get(name))
+            for name, each in contents.connections.items()
+        }
         self.missing = lost_of(recorded or {}, {name: t.count for name, t in self.topics.items()})
         self._packets: dict[str, list[RawPacket]] = {}
 
@@ -208,7 +258,7 @@ class Bag:
 
     def check(self) -> str | None:
         """Read all of the bag; returns its damage in a sentence, ``None`` if there is none."""
-        faults = faults_of(self.folder, {name: topic.count for name, topic in self.topics.items()})
+        faults = faults_of(self._stored, {name: topic.count for name, topic in self.topics.items()})
         return "; ".join([*([self.damage] if self.damage else []), *faults]) or None
 
     def expect(self, name: str, left: int) -> None:
@@ -248,17 +298,67 @@ class Bag:
 
     def message(self, data: bytes, type_name: str) -> Any:
         """A message of a type that the bag has. Raises ``EnvironmentFault`` for other bytes."""
-        with damage_of(self.folder, f"a packet of type {type_name}"):
-            return self.store.deserialize_cdr(data, type_name)
+        return next(t for t in self.topics.values() if t.type == type_name).decode(data)
+
+    def chosen(self, patterns: Sequence[str]) -> list[RecordedTopic]:
+        """Topics by their names, outputs or connections; ``*`` stands for any characters.
+
+        Raises:
+            UsageError: for a pattern that fits none.
+        """
+        topics = [*self.topics.values()]
+        for pattern in patterns:
+            if not any(is_named(t.name, t.connection, [pattern]) for t in topics):
+                there = ", ".join(t.connection or t.name for t in topics)
+                raise UsageError(f"--topic {pattern}: the bag has no such topic; it has {there}")
+        return [t for t in topics if is_named(t.name, t.connection, patterns)]
+
+    def first_packets(self, name: str, count: int) -> list[bytes]:
+        """The first packets of a topic that can be read, in the order of the file."""
+        return [each.data for each in islice(self._stored.messages(only=name), count)]
+
+    def undecodable(self) -> dict[str, str]:
+        """By topic that cannot be decoded, the reason, in a sentence."""
+        found = {}
+        for name, topic in self.topics.items():
+            try:
+                _ = topic.definition
+            except EnvironmentFault as fault:
+                found[name] = str(fault)
+        return found
+
+    def convert(self, folder: Path, topics: Collection[str]) -> int:
+        """Write topics into a new rosbag2 folder, an MCAP file with all definitions; returns how
+        many packets it has.
+
+        Raises:
+            EnvironmentFault: for a damaged bag, and a topic that cannot be decoded.
+            OSError: if it cannot be written.
+        """
+        writer = BagWriter(folder, self.custom)
+        try:
+            numbers = {}
+            for name in topics:
+                each, how = self.topics[name], self.topics[name].definition
+                kind = each.type if "/srv/" in each.type else how.name
+                kept = Topic(name, kind, each.is_reliable, each.depth, None, each.is_latched)
+                numbers[name] = writer.add_topic(kept, how.store)
+            for topic, log_ns, publish_ns, data, _ in self._stored.messages(self.refuse):
+                if topic in numbers:
+                    writer.put(numbers[topic], log_ns, publish_ns, data)
+            writer.close()
+        except BaseException:
+            writer.shut()
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
+        return sum(writer.counts.values())
 
     def packets_of(self, name: str) -> list[RawPacket]:
         """All packets of a topic, by their wall time."""
         if name not in self._packets:
             packets = [
                 RawPacket(log_ns, publish_ns, data)
-                for _, log_ns, publish_ns, data, _ in stored_messages(
-                    self.folder, self.refuse, name
-                )
+                for _, log_ns, publish_ns, data, _ in self._stored.messages(self.refuse, name)
             ]
             self.expect(name, len(packets))
             packets.sort(key=itemgetter(0))
@@ -282,7 +382,7 @@ def open(run: str | os.PathLike[str]) -> Bag:
     Warns if packets have been lost since the run ended.
 
     Args:
-        run: the run folder, or a rosbag2 folder.
+        run: the run folder, a rosbag2 folder, or one file of a bag.
 
     Raises:
         UsageError: if there is no bag, or this version of NeuROS cannot read it.
@@ -297,10 +397,11 @@ def open(run: str | os.PathLike[str]) -> Bag:
 def open_bag(run: str | os.PathLike[str]) -> Bag:
     """Open the bag of a run, as :func:`open`, but without a warning."""
     folder = Path(run)
+    has_files = folder.is_dir() and bool(bag_files(folder))
     if not (folder / PLAN_NAME).is_file():
         if folder.name == BAG_NAME and (folder.parent / PLAN_NAME).is_file():
             folder = folder.parent
-        elif (folder / "metadata.yaml").is_file():
+        elif folder.is_file() or (folder / METADATA_NAME).is_file() or has_files:
             return Bag(folder, {})
     plan, recorded = load_plan(folder), recorded_counts(folder)
     if needs_repair(folder, plan):

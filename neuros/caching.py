@@ -6,7 +6,7 @@ import contextlib
 import fcntl
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +37,19 @@ class Kept:
     def locked(self, *, wait: bool = True) -> contextlib.AbstractContextManager[bool]:
         """Lock the folder for its build or removal, as :func:`locked`."""
         return locked(self.beside(".lock"), wait=wait)
+
+    def build(self, make: Callable[[], object], on_wait: Callable[[], object]) -> None:
+        """Call ``make`` with the lock held; ``on_wait`` before, if another process holds it.
+
+        ``make`` returns at once where the other process has built the folder. Raises ``OSError``.
+        """
+        with self.locked(wait=False) as is_mine:
+            if is_mine:
+                make()
+                return
+        on_wait()
+        with self.locked():
+            make()
 
 
 def kept_in(cache: Path) -> list[Path]:

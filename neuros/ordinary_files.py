@@ -1,8 +1,4 @@
-"""Files in folders to which nodes in containers may write, as the run folder.
-
-A link there would redirect a write to another file of the user. So these functions write to a new
-file, which then gets the name, and follow no links.
-"""
+"""Files that are read and written as a whole, and errors of files in words."""
 
 from __future__ import annotations
 
@@ -11,38 +7,29 @@ import errno
 import os
 import pwd
 import stat
-from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
-
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 
 
 def open_ordinary(path: Path) -> BinaryIO:
     """Open a file for reading. Raises ``OSError``: also if it is a pipe, a device or a folder."""
-    return open(path, "rb", opener=lambda *_: descriptor_of(path))
 
+    def opener(name: str, flags: int) -> int:
+        descriptor = os.open(name, flags | os.O_NONBLOCK)
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            return descriptor
+        os.close(descriptor)
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), name)
+        raise OSError("it is not an ordinary file")
 
-def descriptor_of(path: Path, flags: int = 0) -> int:
-    """As :func:`open_ordinary`, a file descriptor; ``flags``: further flags of ``os.open``."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | flags)
-    if stat.S_ISREG(os.fstat(descriptor).st_mode):
-        return descriptor
-    os.close(descriptor)
-    if path.is_dir():
-        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-    raise OSError("it is not an ordinary file")
+    return open(path, "rb", opener=opener)
 
 
 def open_new(path: Path) -> BinaryIO:
     """Open a new file in the place of an old one. Raises ``OSError``: also for a folder."""
     path.unlink(missing_ok=True)
     return open(path, "xb")
-
-
-def open_log(path: Path) -> BinaryIO:
-    """Open a file for appending. Raises ``OSError``: also for a link."""
-    return open(path, "ab", opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW, 0o666))
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -56,45 +43,6 @@ def write_whole(path: Path, data: bytes) -> None:
         with contextlib.suppress(OSError):
             part.unlink()
         raise
-
-
-@contextlib.contextmanager
-def folder_in(root: Path, *names: str, makes: bool = False) -> Iterator[Path]:
-    """A path to the folder ``names`` below ``root``, which nobody else can replace.
-
-    Within the block the path leads to the same folder, even if another one takes its name.
-
-    Args:
-        makes: make folders that are missing.
-
-    Raises:
-        OSError: also if one of the names is a link.
-    """
-    descriptor, folder = os.open(root, _FOLDER), root
-    try:
-        for name in names:
-            folder /= name
-            try:
-                if makes:
-                    with contextlib.suppress(FileExistsError):
-                        os.mkdir(name, dir_fd=descriptor)
-                below = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=descriptor)
-            except OSError as error:
-                is_link = error.errno == errno.ENOTDIR
-                why = "it is a link, or no folder" if is_link else error.strerror
-                raise OSError(error.errno, why, str(folder)) from error
-            os.close(descriptor)
-            descriptor = below
-        held = f"/proc/self/fd/{descriptor}"
-        try:
-            yield Path(held)
-        except OSError as error:
-            if not str(error.filename).startswith(held):
-                raise
-            path = str(folder) + error.filename.removeprefix(held)
-            raise OSError(error.errno, error.strerror, path) from error
-    finally:
-        os.close(descriptor)
 
 
 def reason_of(error: OSError) -> str:

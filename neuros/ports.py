@@ -97,8 +97,8 @@ class Packets(Protocol):
     def packet_class(self, type_name: str) -> type:
         """The message class of a type, or NumPy's array. Raises ``EnvironmentFault``."""
 
-    def make(self, type_name: str) -> Packet:
-        """A new message with default values, or an array of zeros."""
+    def maker(self, type_name: str) -> Callable[[], Packet]:
+        """A function that makes a new message with default values, or an array of zeros."""
 
     def checker(self, type_name: str, *, for_jpeg: bool = False) -> Callable[[Packet], Packet]:
         """A check of packets of a type, also for JPEG.
@@ -201,6 +201,15 @@ class NodeLoop(NodeEvents, Protocol):
     @property
     def zero_ns(self) -> int: ...
 
+    def announce(self, duration_ns: int) -> None:
+        """The hook that starts now takes at least so long."""
+
+    def ready(self) -> None:
+        """The initialise hooks have run, but for those that wait for packets."""
+
+    def at_zero(self, event: Callable[[], None], first_pass: Callable[[], None]) -> None:
+        """Handle two events at time 0 of the run; the second after the first of all nodes."""
+
     def hold(self, duration_ns: int) -> None:
         """The hook that has just run takes so long."""
 
@@ -213,8 +222,11 @@ class NodeLoop(NodeEvents, Protocol):
     def end(self, drain_s: float) -> None:
         """The node asks for the end: nothing happens after this instant until :meth:`drain`."""
 
-    def drain(self, event: Callable[[], None], stop: Callable[[], None]) -> None:
-        """Handle ``event`` when the end reaches the node; ``stop`` it if it drains for too long."""
+    def drain(self, event: Callable[[], None], stop: Callable[[], None], *, is_asked: bool) -> None:
+        """Handle ``event`` when the end reaches the node; ``stop`` it if it drains for too long.
+
+        ``is_asked``: a node has asked for the end; else it is now.
+        """
 
 
 class VirtualRun(EventLoop, Protocol):
@@ -330,9 +342,6 @@ WorldLook: TypeAlias = "Callable[[Mapping[str, Any], int], Mapping[str, Any]]"
 Changes: TypeAlias = "Mapping[str, tuple[Mapping[str, str], Mapping[str, Any]]]"
 """By node, the variables of its environment and the parameters of its ROS node that change."""
 
-Advance: TypeAlias = "Callable[[], Mapping[str, Packet]]"
-"""Steps a world that runs by itself, to packets that are due or less far; returns them."""
-
 
 class VirtualClock(Protocol):
     """The clock of a run in virtual time, for a simulator that steps itself."""
@@ -348,6 +357,10 @@ class VirtualClock(Protocol):
 
     def send(self, packets: Mapping[str, Packet], sent: Callable[[], None]) -> None:
         """Send packets, by output, as soon as a hook could; then call ``sent``."""
+
+
+Advance: TypeAlias = "Callable[[], Mapping[str, Packet]]"
+"""Steps a world that runs by itself, to packets that are due or less far; returns them."""
 
 
 class NodeContext(Protocol):

@@ -45,8 +45,14 @@ def to_stamp(seconds: float = 0.0, *, nanoseconds: int = 0) -> Any:
     """
     from builtin_interfaces.msg import Time
 
-    time_ns = round(seconds * _SECOND_NS) + nanoseconds
-    sec, nanosec = divmod(time_ns, _SECOND_NS)
+    stamp = Time()
+    set_stamp(stamp, round(seconds * _SECOND_NS) + nanoseconds)
+    return stamp
+
+
+def set_stamp(stamp: Any, nanoseconds: int) -> None:
+    """Set a ``Time`` that exists, such as ``packet.header.stamp``. Raises as :func:`to_stamp`."""
+    sec, nanosec = divmod(nanoseconds, _SECOND_NS)
     if not -(1 << 31) <= sec < 1 << 31:
         raise ValueError(f"a stamp has 32 bits for its seconds: {sec} s do not fit")
-    return Time(sec=sec, nanosec=nanosec)
+    stamp.sec, stamp.nanosec = sec, nanosec

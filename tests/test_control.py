@@ -147,7 +147,7 @@ def test_a_number_of_numpy_arrives_as_a_plain_one() -> None:
         ({"kind": "stop", "now": 1}, "unknown field `now`"),
         ({"kind": "probe", "number": True}, "Expected `int`, got `bool` - at `$.number`"),
         ({"kind": "probe", "number": 1.5}, "Expected `int`, got `float` - at `$.number`"),
-        ({"kind": "say", "text": None}, "Expected `str`, got `None` - at `$.text`"),
+        ({"kind": "publish_state", "text": None}, "Expected `str`, got `None` - at `$.text`"),
         ({"kind": "hello", "nodes": ["a", 2]}, "Expected `str`, got `int` - at `$.nodes[1]`"),
         ({"kind": "report", "node": "a", "timeline": [[1]]}, "of length 2, got 1"),
         ({"kind": "report", "node": "a", "metrics": 3}, "got `int` - at `$.metrics`"),

@@ -21,7 +21,7 @@ from neuros.errors import EnvironmentFault, UsageError
 
 _KINDS = {
     name: f"benchmarks.reproduce.{name}"
-    for name in ("elevator", "headdirection", "tick", "voting", "whiskeye")
+    for name in ("elevator", "headdirection", "orchestrations", "tick", "voting", "whiskeye")
 }
 
 

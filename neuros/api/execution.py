@@ -38,6 +38,7 @@ from neuros.backends.console import (
 from neuros.backends.control_sockets import UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
 from neuros.backends.node_command import with_messages
+from neuros.backends.portable import common_variables
 from neuros.backends.process_launchers import WITHOUT_ROS
 from neuros.backends.reaper import Reaper
 from neuros.backends.sessions import RunOnThisMachine, reaper_environment, this_process
@@ -48,7 +49,6 @@ from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
 from neuros.options import recorded_values
-from neuros.ordinary_files import open_log
 from neuros.ports import Shown, View
 from neuros.recording.recording_plan import RecordingPlan
 
@@ -234,6 +234,7 @@ class Execution:
         record |= {
             "backend": self._plan.back_end.name,
             "is_one_process": self._plan.back_end.is_one_process,
+            "is_portable": self._plan.project.is_portable,
             **self._plan.deployment.record(),
             "domain_id": self._domain.id,
             "namespace": self._plan.project.names.namespace,
@@ -320,10 +321,13 @@ class Execution:
 
     def _environment(self) -> dict[str, str]:
         """Variables of every node; they override those of the shell."""
+        plan = self._plan
+        is_portable = plan.project.is_portable and plan.back_end.is_one_process
         is_in_notebook = os.environ.get("MPLBACKEND", "").startswith("module://")
         return {
-            **self._plan.network.environment(os.environ),
-            ELSEWHERE_VARIABLE: ",".join(self._plan.elsewhere),
+            **plan.network.environment(os.environ),
+            **(common_variables(plan.nodes, os.environ) if is_portable else {}),
+            ELSEWHERE_VARIABLE: ",".join(plan.elsewhere),
             # The back end that a notebook sets for Matplotlib exists in the notebook only.
             **({"MPLBACKEND": ""} if is_in_notebook else {}),
             "NEUROS_RUN_ID": self._run_id,
@@ -423,7 +427,7 @@ class Console:
         """
         if severity == "DEBUG":
             record = format_record(severity, "neuros", text)
-            with contextlib.suppress(OSError), open_log(self._log_file) as log:
+            with contextlib.suppress(OSError), open(self._log_file, "ab") as log:
                 log.write(f"{record}\n".encode(errors="backslashreplace"))
             return
         self.poll()

@@ -42,7 +42,7 @@ _LONG_BYTES = 1 << 20
 """Larger files in the folder of a container are data, not a recipe."""
 _CLOSE = 0.8  # similarity in difflib's scale, as of besides and beside
 _MJCF = (".xml", ".mjcf")
-_MODELS = (*_MJCF, ".urdf", ".sdf", ".world")
+_MODELS = (*_MJCF, ".urdf", ".xacro", ".sdf", ".world")
 _PLACE = re.compile(r"(\S.*?):(\d+):(\d+): (.*)")
 _LINE = re.compile(r"\bline (?:number=)?(\d+)", re.IGNORECASE)
 
@@ -95,6 +95,7 @@ def load_with_messages(
         if problems:
             raise ProjectError(problems)
     doubts = (
+        *messages.doubts(),
         *_unknown_in_containers(loaded.project, workspaces),
         *(doubt for node, check in checks for doubt in check.doubts(node)),
         *(foreseen_failures(loaded.project, messages, looks_beside=False) if reads_plugins else ()),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import atexit
 import contextlib
 import ctypes
@@ -25,6 +26,7 @@ from neuros.api.run import Run
 from neuros.api.run_folder import make_run_folder, removed_folders, save_record, write_node_files
 from neuros.api.run_record import EXIT_ENVIRONMENT, judge, run_record, run_table
 from neuros.backends.console import format_record
+from neuros.backends.portable import check_this_process
 from neuros.control import AtRest, Message, NodeStatus, Ready, Shutdown
 from neuros.errors import NeurosError, RunError, UsageError
 from neuros.launcher.outcome import EXIT_CODES, Outcome
@@ -67,13 +69,16 @@ class LocalRun:
         exposes: whether ROS tools see its topics.
 
     Raises:
-        UsageError: if the run folder cannot be made.
+        UsageError: if the run folder cannot be made, or this Python was started without the
+            variables of a portable run.
     """
 
     _nest_user: ClassVar[LocalRun | None] = None
 
     def __init__(self, plan: Plan, messages: Sequence[Path], *, exposes: bool) -> None:
         request, project = plan.request, plan.project
+        if project.is_portable:
+            check_this_process(plan.nodes)
         sys.path[:0] = [path for path in map(str, messages) if path not in sys.path]
         self._plan = plan
         self._started = time.time()
@@ -117,7 +122,7 @@ class LocalRun:
         )
         atexit.register(self._end_with_program)
         try:
-            with self._inside():
+            with self._thread.until():
                 self._load()
                 self._loop.run_until_idle()
         except BaseException as error:
@@ -148,8 +153,9 @@ class LocalRun:
         if self._run is not None:
             return None
         nodes = self._nodes.values()
-        with self._inside(end_s):
-            self._deliver_sent()
+        with self._thread.until(end_s):
+            if self._sent:
+                self._deliver_sent()
             if self._is_behind or not rounds:
                 self._come_to_rest()
             for _ in range(rounds):
@@ -159,7 +165,10 @@ class LocalRun:
                 ):
                     break
                 self._is_behind = True
-                is_driven = self._is_driven
+                is_driven = False
+                for node in nodes:
+                    engine = node.engine
+                    is_driven = is_driven or (engine is not None and engine.is_driving)
                 for node in nodes:
                     node.step(1, is_driven=is_driven)
                 self._come_to_rest()
@@ -172,7 +181,7 @@ class LocalRun:
         if self._run is not None:
             return None
         began_s = time.monotonic()
-        with self._inside():
+        with self._thread.until():
             self._deliver_sent()
             self._is_behind = True
             for node in self._nodes.values():
@@ -196,6 +205,10 @@ class LocalRun:
         """A packet of its own for the program."""
         return self._middleware.packets.copier(type_name)(content)
 
+    def view(self, type_name: str, content: Any) -> Any:
+        """The packet that the run keeps itself."""
+        return content
+
     def size_of(self, content: Any) -> int:
         """The bytes of a packet when it is serialised."""
         return len(self._middleware.packets.encode(content))
@@ -204,7 +217,7 @@ class LocalRun:
         """Change environments and parameters; see :meth:`HeldRun.change`."""
         if self._run is not None:
             return None
-        with self._inside():
+        with self._thread.until():
             for name, (variables, parameters) in changes.items():
                 self._nodes[name].change(variables, parameters, only_checks=only_checks)
         return self._rest({})
@@ -213,7 +226,7 @@ class LocalRun:
         """State and counters of each node."""
         if self._run is not None or (not self._is_behind and self.advance(0, {}) is None):
             return None
-        return [node.reports.look({}, 0) for node in self._nodes.values()]
+        return [node.reports.status({}, 0) for node in self._nodes.values()]
 
     def reset(
         self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
@@ -223,7 +236,7 @@ class LocalRun:
         is_fixed = self._thread.has_threads or any(node.why_not_reset for node in nodes)
         if self._run is not None or is_fixed:
             return False
-        with self._inside():
+        with self._thread.until():
             self._sent.clear()
             for node in nodes:
                 node.pause()  # takes back what is left of steps, which might go on for ever
@@ -235,7 +248,7 @@ class LocalRun:
                 except NeurosError as error:
                     self._fail(node.name, error)
                     break
-                self._declarations.take(declared(node.name, node.specs))
+                self._declarations.add(declared(node.name, node.specs))
                 self._loop.post(partial(node.start, awaits_others=not self._is_active))
             self._come_to_rest()
         return True
@@ -319,7 +332,7 @@ class LocalRun:
             is_local=True,
         )
         node.load()
-        self._declarations.take(declared(node.name, node.specs))
+        self._declarations.add(declared(node.name, node.specs))
 
     def _activate(self) -> None:
         """Every node is ready: this is time 0 of the run."""
@@ -343,13 +356,6 @@ class LocalRun:
         for deliver in sent:
             deliver()
 
-    @property
-    def _is_driven(self) -> bool:
-        for node in self._nodes.values():
-            if node.engine is not None and node.engine.is_driving:
-                return True
-        return False
-
     def _sim_times(self) -> dict[str, float]:
         nodes = self._nodes.values()
         return {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None}
@@ -362,7 +368,7 @@ class LocalRun:
             self._next_report_s = now_s + _REPORT_S
             for node in self._nodes.values():
                 node.reports.write_logs()
-                self._outcome.take(node.reports.report(), now_s)
+                self._outcome.add(node.reports.report(), now_s)
         packets = {}
         for name, number in known.items():
             node_name, _, output = name.partition(".")
@@ -370,10 +376,6 @@ class LocalRun:
             if history is not None and history.count > number:
                 packets[name] = history.count, history.since(number)
         return AtRest(0, self._sim_times(), packets)
-
-    def _inside(self, end_s: float | None = None) -> _Thread:
-        """The thread of the program for nodes, until a time (monotonic, seconds)."""
-        return self._thread.until(end_s)
 
     def _describe_hang(self, thread: int) -> str:
         """Where a hook stands that does not return."""
@@ -457,11 +459,11 @@ class LocalRun:
                 except KeyboardInterrupt as error:
                     interruption = error
                     outcome.fail("ended by Ctrl+C", EXIT_CODES[signal.SIGINT])
-            with self._inside():
+            with self._thread.until():
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
                     node.reports.write_logs()
-                    outcome.take(node.reports.report(is_final=True), time.monotonic())
+                    outcome.add(node.reports.report(is_final=True), time.monotonic())
         finally:
             self._middleware.close()
             self._contexts.close()
@@ -477,7 +479,7 @@ class LocalRun:
         last_round = self._declarations.last_round(stopped)
         try:
             is_virtual = self._plan.project.is_virtual
-            with self._inside(None if is_virtual else time.monotonic() + drain_s):
+            with self._thread.until(None if is_virtual else time.monotonic() + drain_s):
                 for node in self._nodes.values():
                     node.drain(last_round.get(node.name, ()))
                 self._loop.run_until_idle()
@@ -497,6 +499,7 @@ class LocalRun:
         record |= {
             "backend": NAME,
             "is_one_process": True,
+            "is_portable": plan.project.is_portable,
             "domain_id": None,
             "namespace": plan.project.names.namespace,
             "started": self._started,
@@ -569,6 +572,7 @@ class _Thread:
         self._outer: LocalLoop | None = None
         self._left_s = -math.inf
         self._others: set[threading.Thread] = set()
+        self._count = -1  # of threads, when the others were looked up
         self._begun: set[threading.Thread] = set()
         with self.turn:
             _Thread._open += 1
@@ -586,8 +590,8 @@ class _Thread:
                 " at it"
             )
 
-    def until(self, end_s: float | None) -> _Thread:
-        """Interrupt at a time (monotonic, seconds)."""
+    def until(self, end_s: float | None = None) -> _Thread:
+        """The thread for nodes; they are interrupted at a time (monotonic, seconds)."""
         self.check_outside()
         if end_s is not None:
             self._watchdog = _Watchdog(end_s, self._loop, self._describe_hang)
@@ -612,8 +616,9 @@ class _Thread:
             self._is_inside = False
             self.turn.release()
             raise
-        if threading.active_count() != len(self._others):
-            self._others = {*threading.enumerate()}
+        # threading.active_count() takes thirty times as long.
+        if (count := _thread._count()) != self._count:
+            self._count, self._others = count, {*threading.enumerate()}
         if watchdog is not None:
             watchdog.begin()
 
@@ -629,7 +634,7 @@ class _Thread:
         except StepTimeout:
             hang = watchdog.hang if watchdog is not None else ""
         # While nodes are loaded, the thread that asks git may end.
-        if threading.active_count() > len(self._others) or self._left_s < 0:
+        if _thread._count() > self._count or self._left_s < 0:
             begun = self._begun | ({*threading.enumerate()} - self._others)
             self._begun = {thread for thread in begun if thread.is_alive()}
         self._leave()
@@ -692,7 +697,7 @@ def _handler() -> object:
 
 
 def _is_main() -> bool:
-    return threading.current_thread() is threading.main_thread()
+    return threading.get_ident() == threading.main_thread().ident
 
 
 class _Watchdog:

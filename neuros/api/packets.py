@@ -132,8 +132,8 @@ class PacketLists:
 def read_packets(run_folder: Path, connection: Connection) -> PacketLists:
     """Read the lists of a connection; a killed node has not written the newest entries."""
     index = connection.index
-    sender = _node_folder(run_folder, connection.source_node) / FOLDER
-    receiver = _node_folder(run_folder, connection.destination_node) / FOLDER
+    sender = node_folder(run_folder, connection.source_node) / FOLDER
+    receiver = node_folder(run_folder, connection.destination_node) / FOLDER
     taken_before, (taken, taken_ns) = _beside(
         _list(receiver / f"{index}.taken", np.int64),
         _list(receiver / f"{index}.taken_ns", np.int64),
@@ -181,7 +181,7 @@ def _list(file: Path, kind: Any) -> tuple[int, Numbers]:
     return before, found[0] if len(found) == 1 else np.concatenate(found)
 
 
-def _node_folder(run_folder: Path, node: str) -> Path:
+def node_folder(run_folder: Path, node: str) -> Path:
     """The folder of a node in a run folder, or in one that holds those of the parts of a run."""
     own = run_folder / node
     if (own / "node.json").exists():

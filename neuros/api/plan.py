@@ -17,7 +17,8 @@ from typing import Any
 from neuros.api.kept import Sources, find_sources, given_sources
 from neuros.api.request import Duration, Request
 from neuros.backends.node_command import place, usable_cores, without_mark
-from neuros.backends.process_launchers import WITHOUT_ROS
+from neuros.backends.portable import portable_project
+from neuros.backends.process_launchers import VIRTUAL_ROS, WITHOUT_ROS
 from neuros.backends.pythons import Pythons, require_one_python
 from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
@@ -220,7 +221,9 @@ class Plan:
         """The launcher of the back end; it reports its processes to ``reaper``."""
         transport = self.deployment.transport or self.back_end.transport
         end, is_virtual = self.request.end, self.project.is_virtual
-        options = ["--transport", WITHOUT_ROS if is_virtual else transport]
+        if is_virtual:
+            transport = WITHOUT_ROS if self.back_end.is_one_process else VIRTUAL_ROS
+        options = ["--transport", transport]
         if is_virtual and end.wall_s is not None:
             options += ["--duration", repr(end.wall_s)]
         if self.request.real_time_factor is not None:
@@ -268,6 +271,10 @@ def make_plan(
     except UnicodeEncodeError:
         text = f"{project.folder}: the name is not UTF-8, as ROS needs it: rename it"
         raise UsageError(text) from None
+    if project.is_portable if request.portable is None else request.portable:
+        project = portable_project(project, os.environ)
+    else:
+        project = replace(project, is_portable=False)
     network = chosen_network(request.network, request.peers)
     known = [node.name for node in project.nodes]
     for name in request.nodes:
@@ -404,11 +411,6 @@ def _check_time(plan: Plan) -> None:
             raise UsageError(
                 f"{option}: nodes elsewhere are in real time: leave out --time virtual"
             )
-    if not plan.back_end.is_one_process:
-        raise UsageError(
-            f"virtual time: the nodes of the back end {plan.back_end.name} are in several"
-            " processes: use --backend in-process"
-        )
 
 
 def _check_isolation(plan: Plan) -> None:
@@ -460,9 +462,9 @@ def make_environments(pythons: Pythons, messages: Messages | None, output: Strea
     Raises:
         EnvironmentFault: with all failures.
     """
-    pythons.note_use()
+    pythons.record_use()
     if messages is not None:
-        messages.note_use()
+        messages.record_use()
     if are_made(pythons, messages):
         return
     # The reaper ends pip, the compiler, and their children when the launcher is killed.

@@ -198,6 +198,15 @@ class Request(ProjectOptions):
         page="placement.md",
         help="ignore affinity: the kernel chooses the cores of every node",
     )
+    portable: bool | None = option(
+        "--portable",
+        is_negatable=True,
+        default_help="the project's; off",
+        page="deterministic_runs.md#on-another-processor",
+        help="fix what glibc, NumPy, OpenBLAS and MKL choose by the processor, and numbers of"
+        " threads, so that a deterministic run has the same packets on every x86-64 machine with"
+        " the same libraries; linear algebra is slower",
+    )
     monitor_system_load: bool = option(
         "-m",
         "--monitor-system-load",

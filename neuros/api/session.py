@@ -184,8 +184,9 @@ class Session:
             self._check_running()
             if until is not None and self._held.is_behind and not self._advance(0, end_s):
                 return False
-            for _ in self._rounds(count, sim_s, until):
-                if not self._advance(1, end_s):
+            is_counted = sim_s is None and until is None
+            for _ in range(count) if is_counted else self._rounds(sim_s, until):
+                if not self._take(self._held.advance(1, self._known, end_s)):
                     return False
             return self.is_running  # `until` may have closed it
 
@@ -553,21 +554,19 @@ class Session:
     # ------------------------------------------------------------------ inside
 
     def _rounds(
-        self, rounds: int, sim_s: float | None, until: Callable[[Session], object] | None
+        self, sim_s: float | None, until: Callable[[Session], object] | None
     ) -> Iterator[None]:
         """As many turns as there are rounds to go."""
         if until is not None:
             while not until(self):
                 yield
-        elif sim_s is not None:
+        if sim_s is not None:
             end_s = self._sim_now() + sim_s
             at_rest = 0
             while (now_s := self._sim_now()) < end_s - _FINE:
                 yield
                 at_rest = 0 if self._sim_now() > now_s else at_rest + 1
                 self._check_progress(at_rest)
-        else:
-            yield from (None for _ in range(rounds))
 
     def _run_sim(self, duration_s: float) -> bool:
         """Grant many rounds at once, but none that is to begin after the end.
@@ -736,6 +735,14 @@ class SessionOutput:
         return self._session._copy(self._port, received.newest) if received.count else None
 
     @property
+    def shared_packet(self) -> Any:
+        """As :attr:`packet`, without a copy: nobody may change it."""
+        received = self._session._received(self.name)
+        if not received.count:
+            return None
+        return self._session._held.view(self._port.type, received.newest)
+
+    @property
     def packets(self) -> list[Any]:
         """The packets since this was looked at last, oldest first.
 
@@ -848,6 +855,8 @@ def check_length(
     Raises:
         UsageError: for it, and for more than one.
     """
+    if rounds is None and sim_s is None and until is None:
+        return 1
     given = {"rounds": rounds, "sim_s": sim_s, "until": until}
     names = [name for name, value in given.items() if value is not None]
     if len(names) > 1:

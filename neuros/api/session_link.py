@@ -19,7 +19,7 @@ from neuros.control import (
     Change,
     Deliver,
     Ended,
-    LookAll,
+    GetStatus,
     Message,
     NodeStatus,
     Pause,
@@ -92,6 +92,9 @@ class HeldRun(Protocol):
 
     def copy(self, type_name: str, content: Any) -> Any:
         """A packet of its own for the program, from the content that came with an answer."""
+
+    def view(self, type_name: str, content: Any) -> Any:
+        """The packet of such a content, which nobody may change."""
 
     def size_of(self, content: Any) -> int:
         """The bytes of the content of a packet."""
@@ -203,6 +206,8 @@ class LaunchedRun:
     def copy(self, type_name: str, content: bytes) -> Any:
         return self._packets.decode(type_name, content)
 
+    view = copy
+
     def size_of(self, content: bytes) -> int:
         return len(content)
 
@@ -235,7 +240,7 @@ class LaunchedRun:
 
         if not self.is_behind:  # else a round goes on, perhaps for ever
             self.advance(0, {})  # what was sent has arrived then
-        self._send(LookAll({}))
+        self._send(GetStatus({}))
         return [*found.values()] if self._wait_for(is_last, None) else None
 
     def stop(self, reason: str) -> None:

@@ -16,6 +16,7 @@ from xxhash import xxh3_64_intdigest
 
 from neuros.api.packets import Numbers, PacketLists, read_packets
 from neuros.api.run_record import PastRun
+from neuros.arithmetic import differences
 from neuros.bag import Bag, RecordedTopic, open_bag
 from neuros.errors import NeurosError
 from neuros.recording.recording_plan import PLAN_NAME
@@ -110,6 +111,8 @@ class RunComparison:
         compared: packets that were found equal.
         consumed_differently: connections with equal packets, of which hooks consumed others.
         not_compared: connections of which not all packets could be compared.
+        likely_cause: for runs that differ, how processors and libraries of nodes did, in words;
+            empty if they did not.
     """
 
     difference: str | None
@@ -117,6 +120,7 @@ class RunComparison:
     compared: int
     consumed_differently: tuple[str, ...] = ()
     not_compared: tuple[str, ...] = ()
+    likely_cause: str = ""
 
 
 @dataclass(frozen=True)
@@ -198,7 +202,7 @@ class _Comparer:
         self._compared = 0
 
     def result(self) -> RunComparison:
-        text = None
+        text, cause = None, ""
         if self.differences:
             first = min(self.differences, key=lambda difference: difference.at_ns)
             others = len(self.differences) - 1
@@ -206,12 +210,17 @@ class _Comparer:
                 differ = "connections differ" if others > 1 else "connection differs"
                 self._remarks.append(f"{others} more {differ}, from a later moment on")
             text = _told(first, self._runs, self._recorded)
+            records = [run.record for run in self._runs]
+            cause = differences(*(record.get("arithmetic") or {} for record in records))
+            if cause and not all(record.get("is_portable") for record in records):
+                cause += " (run both with --portable)"
         return RunComparison(
             text,
             tuple(self._remarks),
             self._compared,
             tuple(self._consumed_differently),
             tuple(self._not_compared),
+            cause,
         )
 
     def compare(self, name: str) -> None:

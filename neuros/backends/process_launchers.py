@@ -29,6 +29,9 @@ from neuros.stacks import ProcessThreads, threads_of
 WITHOUT_ROS = "local"
 """The transport of nodes of one process that no ROS tool finds."""
 
+VIRTUAL_ROS = "virtual-ros"
+"""The transport of nodes in processes or containers of their own, in virtual time."""
+
 
 class ProcessBackEnd(BackEnd):
     """A process per node; the last choice of ``auto``."""

@@ -195,7 +195,7 @@ class Pythons:
         """Whether all environments exist."""
         return not any(choice.base for choice in self._each())
 
-    def note_use(self) -> None:
+    def record_use(self) -> None:
         """Record the use of each choice, where the cache can be written."""
         for choice in self._each():
             with contextlib.suppress(OSError):

@@ -114,12 +114,9 @@ class _Children:
     ) -> None:
         """Start a process; the answer is its number, or the error."""
         import subprocess
-        from pathlib import Path
-
-        from neuros.ordinary_files import open_log
 
         try:
-            with open_log(Path(log)) as output, children_on(cores):
+            with open(log, "ab") as output, children_on(cores):
                 process = subprocess.Popen(
                     command,
                     stdin=subprocess.DEVNULL,
@@ -192,8 +189,7 @@ def _import_the_rest() -> None:
 
         # Orphans of the run, such as daemons, become children of this process.
         ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
-        import neuros.backends.shared_memory
-        import neuros.ordinary_files  # noqa: F401
+        import neuros.backends.shared_memory  # noqa: F401
 
 
 def clean_up(run_id: str, orders: Orders, processes: RunProcesses | None = None) -> None:

@@ -13,13 +13,12 @@ import os
 import signal
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
 
 from neuros.backends.console import clean
 from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses, environ_of, started_at
 from neuros.control import TO_OBSERVERS, Interrupt, Watch
-from neuros.control.link import ControlLink, read_as
+from neuros.control.link import ControlLink, read_as, with_texts
 from neuros.errors import ControlError, EnvironmentFault
 
 _VARIABLE = "NEUROS_GUARDED_RUN"
@@ -115,11 +114,13 @@ def _found() -> Iterator[RunOnThisMachine]:
     for name in filter(str.isdigit, os.listdir("/proc")):
         for variable in environ_of(int(name)):
             if variable.startswith(mark):
-                # Another version of NeuROS, or another user, may have written anything there.
+                # Another version of NeuROS, or another user, may have written anything there,
+                # control sequences of terminals too.
                 with contextlib.suppress(ControlError, ValueError, TypeError, RecursionError):
                     described = json.loads(variable.removeprefix(mark))
                     described |= {"user": _user_of(int(name))}
-                    yield read_as(RunOnThisMachine, _harmless(described))
+                    described = with_texts(described, lambda text: clean(text, keep_colours=False))
+                    yield read_as(RunOnThisMachine, described)
 
 
 def _user_of(pid: int) -> int | None:
@@ -128,12 +129,3 @@ def _user_of(pid: int) -> int | None:
         return os.stat(f"/proc/{pid}").st_uid
     except FileNotFoundError:
         return None
-
-
-def _harmless(value: Any) -> Any:
-    """A value whose texts have no effect on a terminal."""
-    if isinstance(value, str):
-        return clean(value, keep_colours=False)
-    if isinstance(value, dict):
-        return {_harmless(key): _harmless(each) for key, each in value.items()}
-    return [_harmless(each) for each in value] if isinstance(value, list) else value

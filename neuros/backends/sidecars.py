@@ -15,7 +15,6 @@ from pathlib import Path
 
 from neuros.backends.node_command import process_environment, with_libraries
 from neuros.errors import EnvironmentFault
-from neuros.ordinary_files import open_log
 
 END = b"end\n"
 """Tells the recorder that no more packets come."""
@@ -49,7 +48,7 @@ def start_sidecar(
     """
     whole = process_environment(os.environ, environment)
     try:
-        with open_log(log) as file:
+        with log.open("ab") as file:
             process = subprocess.Popen(
                 list(command),
                 stdin=subprocess.PIPE,

@@ -180,12 +180,10 @@ def make(choice: Choice, progress: Progress, run_environment: Mapping[str, str])
     """
     try:
         choice.entry.folder.parent.mkdir(parents=True, exist_ok=True)
-        with choice.entry.locked(wait=False) as is_mine:
-            if is_mine:
-                return _make(choice, progress, run_environment)
-        progress.step(f"waiting for another launch that makes {_words(choice)}")
-        with choice.entry.locked():
-            _make(choice, progress, run_environment)
+        choice.entry.build(
+            lambda: _make(choice, progress, run_environment),
+            lambda: progress.step(f"waiting for another launch that makes {_words(choice)}"),
+        )
     except OSError as error:
         raise _fault(choice, why_no_files(error, choice.entry.folder.parent)) from error
 

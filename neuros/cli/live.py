@@ -311,7 +311,7 @@ def _watch(
 ) -> Iterator[NodeStatus]:
     """Statuses of a node, one each period until the run is over."""
     from neuros.backends.control_sockets import connect
-    from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, Watch
+    from neuros.control import TO_OBSERVERS, GetStatus, NodeStatus, Watch
     from neuros.control.link import ControlLink
 
     try:
@@ -326,7 +326,7 @@ def _watch(
         while True:
             if time.monotonic() >= next_s:
                 next_s = time.monotonic() + period_s
-                link.send(LookAll(wanted))
+                link.send(GetStatus(wanted))
             if not select.select([link], [], [], max(0.0, next_s - time.monotonic()))[0]:
                 continue
             messages = link.receive()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import contextlib
 import faulthandler
 import json
 import math
@@ -22,6 +23,7 @@ from neuros.project.suggest import counted
 
 if TYPE_CHECKING:
     from neuros.api.run_record import PastRun
+    from neuros.bag import RecordedTopic
     from neuros.hooks import HookSpec
     from neuros.replay.node_replay import NodeVerdict
     from neuros.replay.replayed_node import ReplayedNode
@@ -121,6 +123,21 @@ def add_replay(replay: argparse.ArgumentParser) -> None:
         metavar="ID",
         help="publish in this ROS domain (default: ROS_DOMAIN_ID, else 0)",
     )
+    add(
+        "-p",
+        "--project",
+        metavar="PROJECT",
+        default=".",
+        help="with --remap: the project of the node (default: the current folder)",
+    )
+    add(
+        "--remap",
+        action="append",
+        default=[],
+        metavar="TOPIC:=NODE.PORT",
+        help="with --node, of a bag of any program: give this topic to an input of the node, or in"
+        " the place of an output that the input is connected with (repeatable)",
+    )
     replay.set_defaults(command=_replay)
 
 
@@ -138,6 +155,8 @@ def add_replayed(replayed: argparse.ArgumentParser) -> None:
 def _replay(options: argparse.Namespace) -> int:
     if options.debugpy is not None and not 0 < options.debugpy <= _HIGHEST_PORT:
         raise UsageError(f"replay: --debugpy must be a port from 1 to {_HIGHEST_PORT}")
+    if options.remap:
+        return _replay_bag(options)
     has_debugger = options.pdb or options.debugpy is not None
     if has_debugger and len(options.nodes) != 1:
         raise UsageError("replay: --pdb and --debugpy need one --node NAME")
@@ -168,7 +187,6 @@ def _publish(options: argparse.Namespace) -> int:
     from neuros.backends.domain import given_domain
     from neuros.bag import open_bag
     from neuros.cli.environments import find_messages_of
-    from neuros.recording.recording_plan import is_named
     from neuros.transport.ros_topics import RosTopic, play
 
     domain_id = given_domain(options.domain_id, os.environ)
@@ -176,12 +194,7 @@ def _publish(options: argparse.Namespace) -> int:
     with open_bag(options.run) as bag:
         if bag.damage is not None:
             print(f"neuros: {bag.damage}", file=sys.stderr)
-        topics, patterns = [*bag.topics.values()], options.replay_topics
-        for pattern in patterns:
-            if not any(is_named(t.name, t.connection, [pattern]) for t in topics):
-                there = ", ".join(t.connection or t.name for t in topics)
-                raise UsageError(f"--topic {pattern}: the bag has no such topic; it has {there}")
-        chosen = [t for t in topics if is_named(t.name, t.connection, patterns)]
+        chosen = [t for t in bag.chosen(options.replay_topics) if _can_publish(t, options)]
         packets = sorted(
             (packet.log_time_ns, topic.name, packet.data)
             for topic in chosen
@@ -196,6 +209,62 @@ def _publish(options: argparse.Namespace) -> int:
             domain_id=domain_id,
         )
     print(f"{sent} packets on {len(chosen)} topics")
+    return 0
+
+
+def _can_publish(topic: RecordedTopic, options: argparse.Namespace) -> bool:
+    """Whether ROS here has the type of a topic; one that was named by itself is required.
+
+    Raises:
+        EnvironmentFault: if it is required.
+    """
+    try:
+        why = topic.misfit
+    except EnvironmentFault as fault:
+        why = str(fault)
+    if why and topic.name in options.replay_topics:
+        raise EnvironmentFault(f"replay: {topic.name} cannot be published: {why}")
+    if why:
+        print(f"neuros: {topic.name} is not published: {why}", file=sys.stderr)
+    return not why
+
+
+def _replay_bag(options: argparse.Namespace) -> int:
+    """Give topics of a bag to a node of a project."""
+    from neuros.bag import open_bag
+    from neuros.replay.bag_into_node import replay_into, rules_of
+    from neuros.testing import PluginHarness
+
+    if len(options.nodes) != 1:
+        raise UsageError("replay: --remap needs the node that gets the packets: one --node NAME")
+    (name,) = options.nodes
+    if options.pdb or options.debugpy is not None or options.replay_topics:
+        raise UsageError("replay: --remap takes neither --pdb, --debugpy nor --topic")
+    rules = rules_of(options.remap)
+    project = Path(options.project)
+    if not project.exists():
+        raise UsageError(f"replay: there is no project {project}: name it with --project")
+    folder = None if options.output is None else _folder(options.output)
+    with open_bag(options.run) as bag, contextlib.ExitStack() as stack:
+        try:
+            harness = PluginHarness.from_project(project, name, run_folder=folder)
+        except KeyError:
+            raise UsageError(f"replay: {project} has no node '{name}'") from None
+        stack.enter_context(harness)
+        kept = None if folder is None else folder / "bag"
+        done = replay_into(harness, bag, rules, keep=kept, log=print)
+    for topic, count in done.arrived.items():
+        waiting = done.waiting.get(topic, 0)
+        rest = f", {waiting} of which waited at the end" if waiting else ""
+        print(f"{topic} -> {rules[topic]}: {counted(count, 'packet')}{rest}")
+    starts = ", ".join(f"{hook} {count}" for hook, count in done.executions.items())
+    print(f"starts of hooks: {starts or 'none'}")
+    for output, count in done.sent.items():
+        print(f"{name}.{output}: {counted(count, 'packet')}")
+    if done.ended is not None:
+        print(f"'{name}' ended the project: {done.ended}")
+    if kept is not None:
+        print(kept)
     return 0
 
 

@@ -8,11 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from neuros.cli.common import JSON, add_format, print_json
+from neuros.errors import UsageError
 from neuros.project.suggest import counted
 
 EXIT_DIFFERENT = 1
 EXIT_UNKNOWN = 2
 EXIT_DAMAGED = 4
+EXIT_LEFT_OUT = 4
 EXIT_CONSUMED = 6
 
 
@@ -60,12 +62,15 @@ def _verify(options: argparse.Namespace) -> int:
                 "difference": verdict.difference,
                 "consumed_differently": verdict.consumed_differently,
                 "not_compared": verdict.not_compared,
+                "likely_cause": verdict.likely_cause,
                 "notes": remarks,
             }
         )
         return exit_code
     for remark in remarks:
         print(f"note: {remark}")
+    if verdict.likely_cause:
+        print(f"likely cause: {verdict.likely_cause}")
     print(f"{result}: {what}")
     return exit_code
 
@@ -75,13 +80,38 @@ def _were(connections: Sequence[str]) -> str:
     return f"{counted(len(connections), 'connection')} {verb}"
 
 
+_A_BAG = "the run folder, or a bag: a folder, .mcap or .db3, compressed or not"
+
+
 def add_bag(bag: argparse.ArgumentParser) -> None:
     """Add the options of the command."""
-    bag.description = "Show what a run has recorded, or complete the bag of a run that was cut off."
+    bag.description = (
+        "Show what a bag has, of a run or of another program; convert it; or complete the bag of a"
+        " run that was cut off."
+    )
     actions = bag.add_subparsers(title="actions", metavar="ACTION", required=True)
     info = actions.add_parser("info", help="show the topics of a bag")
-    info.add_argument("run", metavar="RUN", help="the run folder, or a bag")
+    info.add_argument("run", metavar="RUN", help=_A_BAG)
     info.set_defaults(command=_info)
+    convert = actions.add_parser(
+        "convert",
+        help="write a bag anew, as MCAP with all definitions of messages",
+        description="Write a bag of any storage and compression anew, as one MCAP file with the"
+        " definitions of its messages, which every program can read.",
+    )
+    convert.add_argument("run", metavar="BAG", help=_A_BAG)
+    convert.add_argument("-o", "--output", required=True, metavar="FOLDER", help="a new folder")
+    convert.add_argument(
+        "-t",
+        "--topic",
+        action="append",
+        default=[],
+        dest="topics",
+        metavar="NAME",
+        help="this topic, output (node.output) or connection only (repeatable); * stands for any"
+        " characters",
+    )
+    convert.set_defaults(command=_convert)
     repair = actions.add_parser(
         "repair",
         help="complete the bag of a run that was killed",
@@ -104,12 +134,37 @@ def _info(options: argparse.Namespace) -> int:
     with open_bag(options.run) as opened:
         rows = [[t.name, t.type, t.count] for t in opened.topics.values()]
         print(tabulate(rows, headers=["topic", "type", "packets"], disable_numparse=True))
-        print(f"\n{opened.folder}: {opened.duration_s:.2f} s, project {opened.project or '?'}")
+        about = [f"{opened.duration_s:.2f} s"]
+        about += [f"project {opened.project}"] if opened.project else []
+        about += [f"ROS {opened.distribution.capitalize()}"] if opened.distribution else []
+        print(f"\n{opened.folder}: {', '.join(about)}")
+        for note in (*opened.notes, *opened.undecodable().values()):
+            print(f"note: {note}")
         damage = opened.check()
     if damage is None:
         return 0
     print(f"neuros: {damage}", file=sys.stderr)
     return EXIT_DAMAGED
+
+
+def _convert(options: argparse.Namespace) -> int:
+    from neuros.bag import open_bag
+    from neuros.cli.environments import find_messages_of
+
+    find_messages_of(Path(options.run))
+    output = Path(options.output)
+    if output.exists():
+        raise UsageError(f"bag convert: {output} exists: name a new folder")
+    with open_bag(options.run) as opened:
+        chosen = opened.chosen(options.topics or ["*"])
+        left_out = opened.undecodable()
+        names = [topic.name for topic in chosen if topic.name not in left_out]
+        count = opened.convert(output, names) if names else 0
+        for name in (topic.name for topic in chosen if topic.name in left_out):
+            print(f"neuros: left out: {left_out[name]}", file=sys.stderr)
+    if names:
+        print(f"{output}: {counted(count, 'packet')} on {counted(len(names), 'topic')}")
+    return EXIT_LEFT_OUT if len(names) < len(chosen) else 0
 
 
 def _repair(options: argparse.Namespace) -> int:

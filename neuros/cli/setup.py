@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from neuros.backends.containers import OWN_FOLDER, STANDARD
 from neuros.caching import cache_root
-from neuros.cli.common import JSON, add_format, print_json
+from neuros.cli.common import JSON, add_format, print_json, show_warnings
 from neuros.distribution import ROOT
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
 from neuros.installation.command import add_build_options
@@ -77,6 +77,7 @@ def _build(options: argparse.Namespace) -> int:
     messages = Messages(workspaces, options.packages or workspaces.packages)
     if problems := [*messages.problems(), *workspaces.problems]:
         raise ProjectError(problems)
+    show_warnings(messages.doubts())
     if options.if_compiler and not messages.is_made:
         try:
             Compilers.here()

@@ -139,6 +139,7 @@ class Report(Message, kw_only=True):
         timeline: further points of simulated and wall time, in seconds.
         running_since_s: since when the node has been initialised, on the clock of the run.
         metrics: ``None`` before the node has begun.
+        reasons: why the node does not move, one sentence each; none while it executes a hook.
         stack: where the plugin stands, if its hook runs for long.
         fault: what cannot be recorded.
         compressed: by connection on which the node compresses, bytes before and after.
@@ -154,6 +155,7 @@ class Report(Message, kw_only=True):
     timeline: tuple[tuple[float, float], ...] = ()
     running_since_s: float | None = None
     metrics: Metrics | None = None
+    reasons: tuple[str, ...] = ()
     stack: Stack | None = None
     fault: str | None = None
     compressed: Mapping[str, tuple[int, int]] = {}
@@ -179,10 +181,6 @@ class Probed(Report, kw_only=True):
     is_idle: bool
 
 
-class Loaded(Message):
-    """All plugins of a process are loaded; no hook starts before ``begin``."""
-
-
 class Ready(Message):
     """A node has initialised as far as it can alone; its other hooks wait for ``activate``."""
 
@@ -190,7 +188,10 @@ class Ready(Message):
 
 
 class Hooks(Message):
-    """After a plugin was loaded: the hooks that it declares; of finalise hooks the names."""
+    """A plugin is loaded: the hooks that it declares, of finalise hooks the names.
+
+    No hook starts before ``begin``.
+    """
 
     node: str
     hooks: tuple[HookDeclaration, ...]
@@ -226,14 +227,7 @@ class Failed(Message):
     text: str
 
 
-class Explanation(Message):
-    """Why a node does not move, in answer to ``explain``."""
-
-    node: str
-    lines: tuple[str, ...]
-
-
-class Heard(Message):
+class StateOfPeer(Message):
     """State of another launcher, received from its node; ``None``: that node is gone."""
 
     node: str
@@ -241,7 +235,7 @@ class Heard(Message):
 
 
 class NodeStatus(Message):
-    """State and samples of a node, for the observer with this number; in answer to ``look``.
+    """State and samples of a node, for the observer with this number; in answer to ``get_status``.
 
     ``keeps``: names of the values that its plugin keeps (``node.keep``).
     """
@@ -280,7 +274,7 @@ class AtRest(Message):
 
 
 class WasReset(Message):
-    """Answer to ``reset``; ``why_not``: why the nodes go on as they are, empty if they do not."""
+    """Answer to ``reset``; ``why_not``: why it was refused, empty if it was not."""
 
     why_not: str
 
@@ -294,14 +288,16 @@ class Probe(Message):
     number: int
 
 
-class Explain(Message):
-    """Say why nothing moves."""
-
-
 class Drain(Message):
-    """Stop the hooks that send unasked; ``last_round``: indices of hooks that start once more."""
+    """Stop the hooks that send unasked.
+
+    Attributes:
+        last_round: indices of hooks that start once more.
+        is_asked: whether a node has asked for the end, at a time of the run's clock.
+    """
 
     last_round: Mapping[str, tuple[int, ...]]
+    is_asked: bool = False
 
 
 class Begin(Message):
@@ -320,7 +316,7 @@ class Stop(Message):
     """Start no further hook, finalise and end."""
 
 
-class Say(Message):
+class PublishState(Message):
     """Publish the state of this launcher to its peers."""
 
     text: str
@@ -339,17 +335,22 @@ class Resume(Message):
 
 
 class Step(Message):
-    """While paused, run ``count`` steps; ``is_driven``: some hooks start without a packet."""
+    """While paused, run ``count`` steps; ``is_driven``, to nodes: some hook starts unasked."""
 
     count: int
-    is_driven: bool
+    is_driven: bool = False
 
 
-class Look(Message):
-    """Show an observer what the node does; ``wanted``: what to sample, by node and port."""
+class GetStatus(Message):
+    """Ask every node for its status once.
+
+    Attributes:
+        wanted: what to sample, by node and port.
+        asker: to nodes, the number of the observer.
+    """
 
     wanted: Mapping[str, Mapping[str, Any]]
-    asker: int
+    asker: int = 0
 
 
 class Advance(Message):
@@ -407,18 +408,6 @@ class Watch(Message):
     """An observer is there."""
 
 
-class LookAll(Message):
-    """Ask every node for its status once; ``wanted``: what to sample, by node and port."""
-
-    wanted: Mapping[str, Mapping[str, Any]]
-
-
-class StepAll(Message):
-    """While the run is paused, run ``count`` steps."""
-
-    count: int
-
-
 class End(Message):
     """End the run, drained, with exit code 0."""
 
@@ -465,29 +454,28 @@ class Ended(Message):
 
 
 FROM_NODES: Sequence[type[Message]] = (
-    *(Hello, Loaded, Ready, Report, Probed, Hooks, Finalising, Progress, Shutdown, Failed),
-    *(Explanation, Heard, NodeStatus, AtRest, WasReset),
+    *(Hello, Ready, Report, Probed, Hooks, Finalising, Progress, Shutdown, Failed),
+    *(StateOfPeer, NodeStatus, AtRest, WasReset),
 )
 TO_NODES: Sequence[type[Message]] = (
     *(
         Begin,
         Activate,
         Probe,
-        Explain,
         Drain,
         StopHooks,
         Stop,
-        Say,
+        PublishState,
         Leave,
         Pause,
         Resume,
         Step,
-        Look,
+        GetStatus,
     ),
     *(Advance, Deliver, Reset, Change),
 )
 FROM_OBSERVERS: Sequence[type[Message]] = (
-    *(Watch, LookAll, Pause, Resume, StepAll, End, Interrupt, Advance, Deliver, Reset),
+    *(Watch, GetStatus, Pause, Resume, Step, End, Interrupt, Advance, Deliver, Reset),
     Change,
 )
 TO_OBSERVERS: Sequence[type[Message]] = (

@@ -10,7 +10,7 @@ import os
 import re
 import select
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar, Union
 
 import msgspec
@@ -112,7 +112,9 @@ class ControlLink:
             BlockingIOError: if the stream does not block, and there is nothing to read.
             ControlError: if what arrives is no control channel at all.
         """
-        size = max(_READ_BYTES, min(_missing_bytes(self._received), _MOST_READ_BYTES))
+        length = int.from_bytes(self._received[:_LENGTH_BYTES], "little")
+        missing = length + _LENGTH_BYTES - len(self._received)  # of the first message
+        size = max(_READ_BYTES, min(missing, _MOST_READ_BYTES))
         try:
             data = self.stream.recv(size)
         except BlockingIOError:
@@ -175,7 +177,9 @@ def encode(message: Message) -> bytes:
         data = to_bytes(message)
     except UnicodeEncodeError:
         # What is no character cannot be written anywhere: both ends see its escape in its place.
-        data = to_bytes(_escaped(msgspec.to_builtins(message, builtin_types=(bytes,))))
+        plain = msgspec.to_builtins(message, builtin_types=(bytes,))
+        escape = lambda match: f"\\u{ord(match[0]):04x}"  # noqa: E731
+        data = to_bytes(with_texts(plain, lambda text: _NO_CHARACTER.sub(escape, text)))
     return framed(data)
 
 
@@ -184,13 +188,15 @@ def framed(data: bytes) -> bytes:
     return len(data).to_bytes(_LENGTH_BYTES, "little") + data
 
 
-def _escaped(value: Any) -> Any:
-    """The value, with escapes of half characters in its texts."""
+def with_texts(value: Any, change: Callable[[str], str]) -> Any:
+    """A value of JSON or MessagePack with each text in it, keys of maps too, changed."""
     if isinstance(value, str):
-        return _NO_CHARACTER.sub(lambda match: f"\\u{ord(match[0]):04x}", value)
+        return change(value)
     if isinstance(value, dict):
-        return {_escaped(key): _escaped(each) for key, each in value.items()}
-    return [*map(_escaped, value)] if isinstance(value, list | tuple) else value
+        return {with_texts(k, change): with_texts(each, change) for k, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [with_texts(each, change) for each in value]
+    return value
 
 
 def remove_messages(received: bytearray, peer: str) -> list[bytes]:
@@ -237,7 +243,7 @@ def decode(data: bytes, decoder: msgspec.msgpack.Decoder[Message], peer: str) ->
 
 
 def read_as(declared: type[_Declared], content: Any) -> _Declared:
-    """An object of a class from JSON that somebody else has written.
+    """An object of a class from the JSON of another program.
 
     Raises:
         ControlError: if a field is missing or of a wrong type.
@@ -246,11 +252,6 @@ def read_as(declared: type[_Declared], content: Any) -> _Declared:
         return msgspec.convert(content, declared)
     except msgspec.ValidationError as error:
         raise ControlError(str(error)) from None
-
-
-def _missing_bytes(received: bytearray) -> int:
-    """How much has to come for the first message to be whole."""
-    return int.from_bytes(received[:_LENGTH_BYTES], "little") + _LENGTH_BYTES - len(received)
 
 
 def _shown(data: bytes) -> str:

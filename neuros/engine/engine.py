@@ -13,14 +13,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, Protocol
 
 from neuros.engine.hook import Hook, Source
 from neuros.engine.input_queue import Subscription
 from neuros.engine.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, State
-from neuros.engine.node_ports import Links, NodePorts, Output, PacketType, undeclared
-from neuros.engine.schedule import ExecutionLog, Lifecycle, Pause, Schedule
+from neuros.engine.node_ports import Links, NodePorts, PacketType, undeclared
+from neuros.engine.schedule import FIRST_TURN, ExecutionLog, Lifecycle, Pause, Schedule
 from neuros.engine.send_window import SendWindow
 from neuros.engine.sim_clock import ClockSubscription
 from neuros.errors import HookError
@@ -70,6 +69,7 @@ class Engine:
 
     Attributes:
         all_hooks: in the order of declaration, also those that will not run again.
+        is_driving: whether it has hooks that start unasked, and so drive the project.
         executing: the hook that runs now.
         since_ns: start of the running hook, or else the time up to which ``spent_ns`` counts.
         spent_ns: wall time by cause; each hook counts its own executions.
@@ -111,7 +111,8 @@ class Engine:
         self._lifecycle = Lifecycle(self._schedule, self.send_windows, clock)
         self._sources: dict[tuple[str, ...], Source] = {}
         self._ticks = [h for h in self.all_hooks if h.spec.kind is HookKind.TICK]
-        self._pause = Pause(self._lifecycle, self._ticks, lambda: self._arrivals)
+        self._pause = Pause(self._lifecycle, self._ticks)
+        self.is_driving = any(hook.drives for hook in self.all_hooks)
         self._has_posted_loop_back = False
         self._is_passing = False
         self.executing: Hook | None = None
@@ -155,7 +156,8 @@ class Engine:
         self.send_windows[connection].credit(position, now_ns)
         if not self.execution_log.is_full:
             self.execution_log.record_credit(connection, position, now_ns)
-        self._pass()
+        if self._schedule.candidates:  # else it changes nothing that a pass would find
+            self._pass()
 
     def on_registered(self, connection: Connection) -> None:
         """The receiver of one of the outputs' connections is there."""
@@ -194,6 +196,7 @@ class Engine:
             source = self._sources[names] = Source(names, self.outputs, str(self.node.plugin))
             self._lifecycle.add_source(source)
             self.all_hooks.append(source)
+            self.is_driving = True
         withdraw = source.offer([packets[name] for name in names], accepted)
         self._pass()
         return withdraw
@@ -217,6 +220,9 @@ class Engine:
 
         A second pause revokes the steps that are left. A pause of a draining node has no effect.
         """
+        if self._cause is PAUSED:
+            self._pause.revoke()
+            return
         now_ns = self._wake()
         if not self._lifecycle.is_draining:
             self._pause.begin(now_ns)
@@ -243,7 +249,7 @@ class Engine:
         :class:`~neuros.engine.schedule.Pause`.
         """
         self._wake()
-        self._pause.grant(count, is_driven=is_driven)
+        self._pause.grant(count, self._arrivals, is_driven=is_driven)
         self._pass()
 
     def reading(self, value: int) -> int:
@@ -288,11 +294,6 @@ class Engine:
     def pauses(self) -> Pause:
         """The pause of the node, with its times."""
         return self._pause
-
-    @property
-    def is_driving(self) -> bool:
-        """Whether it has hooks that start unasked, and so drive the project."""
-        return any(hook.drives for hook in tuple(self.all_hooks))
 
     @property
     def tick_start_ns(self) -> int:
@@ -350,7 +351,8 @@ class Engine:
         executing = self.executing  # read once: the engine may change it meanwhile
         if executing is not None:
             return Rest(State.EXECUTING, executing.name)
-        if not self._lifecycle.has_begun or self._lifecycle.awaits_others:
+        lifecycle = self._lifecycle
+        if not lifecycle.has_begun or (not lifecycle.is_active and lifecycle.awaits_others):
             return REGISTERING
         if self._pause.is_on:
             return PAUSED
@@ -372,19 +374,33 @@ class Engine:
         return now_ns
 
     def _pass(self) -> None:
+        """Run each candidate that is ready at its turn, by the turns at the begin of the pass.
+
+        Hooks that run meanwhile add and remove candidates. A new candidate belongs to the pass if
+        its turn is still to come, and was given before the pass began: up to ``last`` to executed
+        hooks, below ``new`` to the others.
+        """
         if self._is_passing:  # hooks never nest, even if one spins: the loop-back continues
             return
-        lifecycle, pause = self._lifecycle, self._pause
+        lifecycle, pause, candidates = self._lifecycle, self._pause, self._schedule.candidates
         if not lifecycle.has_begun:
             return
-        if pause.is_on:
+        if pause.is_on and self._ticks:
             pause.wake_ticks()
-        if self._schedule.candidates:
+        if candidates:
             self._is_passing = True
+            place, last, new = FIRST_TURN - 1, self._schedule.last_turn, self._schedule.new_turn
             try:
-                for hook in self._schedule.one_pass():
-                    if lifecycle.is_stopped:
+                while candidates:
+                    hook: Hook | None = None
+                    for each in candidates:
+                        turn = each.turn
+                        is_in_pass = place < turn <= last and (turn > 0 or turn < new)
+                        if is_in_pass and (hook is None or turn < hook.turn):
+                            hook = each
+                    if hook is None or lifecycle.is_stopped:
                         break
+                    place = hook.turn
                     if pause.is_on and not pause.allows(hook):
                         continue
                     if not hook.blocked or hook.can_send():
@@ -396,7 +412,7 @@ class Engine:
         if lifecycle.is_stopped:
             self._cause = self.rest()
         elif pause.is_on:
-            self._cause = pause.cause_of_rest(self._schedule.candidates, self.since_ns)
+            self._cause = pause.cause_of_rest(candidates, self.since_ns)
         else:
             self._cause = self._schedule.cause_of_rest()
         if not lifecycle.is_active and self._cause is not SCHEDULING and not self._to_itself:
@@ -415,7 +431,7 @@ class Engine:
         self._schedule.move_to_end(hook)
         start_ns = self._clock()
         if self._pause.is_on:
-            self._pause.record_start(hook, start_ns)
+            self._pause.record_start(hook, start_ns, self._arrivals)
         elif hook.ticks is not None:
             hook.ticks.record(start_ns)
             hook.set_due(self._lifecycle.tick_start_ns, start_ns)
@@ -443,7 +459,12 @@ class Engine:
         if end_ns - start_ns > _LONG_NS:
             self._effects.give_way()
         for output, packet in hook.packets_of(result):
-            self._send(output, packet)
+            for window in output.windows:
+                window.spend(end_ns)
+            for connection in output.to_itself:
+                self._send_to_itself(connection, packet)
+            if output.send is not None:
+                output.send(packet)
         if isinstance(hook, Source):
             hook.accept()
         elif hook.spec.kind is HookKind.INITIALISE:
@@ -454,21 +475,15 @@ class Engine:
             if self._pause.is_on:
                 self._pause.wake_ticks()
 
-    def _send(self, output: Output, packet: Any) -> None:
-        """Send a packet on all connections of an output, or on its external topic."""
-        for window in output.windows:
-            window.spend(self.since_ns)
-        for connection in output.to_itself:
-            own = self._effects.copy_to_itself(connection, packet)
-            self._to_itself += 1
-            self._effects.post(partial(self._arrive, connection, own))
-        if output.send is not None:
-            output.send(packet)
+    def _send_to_itself(self, connection: Connection, packet: Any) -> None:
+        own = self._effects.copy_to_itself(connection, packet)
 
-    def _arrive(self, connection: Connection, packet: Any) -> None:
-        """A packet of the node to itself arrives."""
-        self._to_itself -= 1
-        self.on_packet(connection, packet)
+        def arrive() -> None:
+            self._to_itself -= 1
+            self.on_packet(connection, own)
+
+        self._to_itself += 1
+        self._effects.post(arrive)
 
     def _crediting(self, window: SendWindow) -> Callable[[int], None]:
         return lambda position: window.credit(position, self._clock())

@@ -131,7 +131,7 @@ class Hook:
 
     def is_ready(self) -> bool:
         """Whether the hook may start now, by inputs, outputs, timer and the node's phase."""
-        if not (self.is_enabled and self.is_due) or self.missing_input() is not None:
+        if not (self._is_enabled and self._is_due) or self._lacking:
             return False
         return not self.blocked or self.can_send()
 
@@ -143,13 +143,10 @@ class Hook:
 
     def awaited_input(self) -> HookInput | None:
         """The first required input without a packet, if the hook waits for inputs alone."""
-        return self.missing_input() if self._lacking and self._is_enabled and self._is_due else None
-
-    def missing_input(self) -> HookInput | None:
-        """The first required input without a packet."""
-        for hook_input in self.inputs:  # next() over a generator takes thrice as long
-            if hook_input.missing:
-                return hook_input
+        if self._lacking and self._is_enabled and self._is_due:
+            for hook_input in self.inputs:  # next() over a generator takes thrice as long
+                if hook_input.missing:
+                    return hook_input
         return None
 
     def blocking_windows(self) -> list[SendWindow]:

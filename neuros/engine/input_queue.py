@@ -166,12 +166,15 @@ class Subscription:
         self.taken.append(position)
         self.taken_ns.append(now_ns)
         queue.discards_in_a_row = 0
-        if len(self.queues) == 1:
+        if len(self.queues) == 1:  # the common case
             self.counted = position
             self.consumed += 1
+            if self.is_acknowledged:
+                self.acknowledged = position
+                self.acknowledge(position)
         else:
             self._count_passed()
-        self.acknowledge_consumed()
+            self.acknowledge_consumed()
         return packet
 
     def remove(self, queue: InputQueue) -> None:
@@ -191,13 +194,9 @@ class Subscription:
 
     def position_if_consumed(self, queue: InputQueue | None = None) -> int:
         """The smallest position of all queues, as if ``queue`` had consumed its oldest packet."""
-        queues = self.queues
-        if len(queues) == 1 and queue is None:  # the common case
-            return queues[0].position
-        if not queues:
-            return self.received
         return min(
-            other.packets[0][1] if other is queue else other.position for other in self.queues
+            (other.packets[0][1] if other is queue else other.position for other in self.queues),
+            default=self.received,
         )
 
     def _discard_oldest(self, queue: InputQueue) -> None:
@@ -253,33 +252,27 @@ class HookInput:
         for queue in self.queues:
             queue.subscription.queues.append(queue)
         self._filled = 0
-        self.missing = self._count()
+        self.missing = 0 if self.is_optional else len(self.queues) if self.is_all else 1
         self.hook: Consumer
 
     def on_filled(self) -> None:
         """A queue is no longer empty."""
         self._filled += 1
         if self.missing:
-            self.missing = self._count()
+            self.missing -= 1
             if not self.missing:
                 self.hook.on_input_complete()
 
     def on_emptied(self) -> None:
         """A queue is empty."""
         self._filled -= 1
-        was_missing, self.missing = self.missing, self._count()
-        if self.missing and not was_missing:
-            self.hook.on_input_incomplete()
+        if not self.is_optional and (self.is_all or not self._filled):
+            self.missing += 1
+            if self.missing == 1:
+                self.hook.on_input_incomplete()
 
     def on_discarded(self) -> None:
         """The oldest packet of a queue was discarded, and further packets are there."""
-
-    def _count(self) -> int:
-        if self.is_optional:
-            return 0
-        if self.is_all:
-            return len(self.queues) - self._filled
-        return 0 if self._filled else 1
 
     def has_reliable_packet(self) -> bool:
         """Whether a packet of a reliable connection waits here."""
@@ -318,6 +311,8 @@ class HookInput:
     def consume(self, now_ns: int) -> Any:
         """The argument for the hook, which starts."""
         if not self.is_all:
-            queue = self.chosen()
-            return None if queue is None else queue.subscription.consume(queue, now_ns)
+            queue = self.queues[0] if len(self.queues) == 1 else self.chosen()
+            if queue is None or not queue.packets:
+                return None
+            return queue.subscription.consume(queue, now_ns)
         return [q.subscription.consume(q, now_ns) if q.packets else None for q in self.queues]

@@ -8,7 +8,6 @@ import os
 import re
 import shutil
 import ssl
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from neuros.installation.machine import (
     other_python,
     system_install,
 )
-from neuros.installation.progress import Progress
+from neuros.installation.progress import Progress, run_logged
 
 LOG = "neuros-install.log"
 """What uv and pip wrote, in ``.venv``."""
@@ -225,31 +224,15 @@ class Installer:
     def _run(self, command: Sequence[str], environ: Mapping[str, str]) -> str:
         """Run pip or uv, show what it does, and return what it wrote."""
         rows: list[str] = []
-        with (
-            self.log.open("a", encoding="utf-8") as file,
-            subprocess.Popen(
-                command,
-                cwd=self.folder,
-                env=environ,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-                errors="replace",
-            ) as process,
-        ):
-            try:
-                for row in process.stdout or ():
-                    file.write(row)
-                    rows.append(row)
-                    if prepared := re.match(r"Prepared (\d+) packages", row):
-                        self.progress.step(f"unpacking {prepared[1]} packages")
-                    elif re.match(r"\s*(Collecting|Downloading|Building)", row):
-                        self.progress.detail(row.strip())
-            except BaseException:
-                process.terminate()
-                raise
-        if process.returncode:
+
+        def show(row: str) -> None:
+            rows.append(row)
+            if prepared := re.match(r"Prepared (\d+) packages", row):
+                self.progress.step(f"unpacking {prepared[1]} packages")
+            elif re.match(r"\s*(Collecting|Downloading|Building)", row):
+                self.progress.detail(row.strip())
+
+        if run_logged(command, self.log, show, environ=environ, folder=self.folder):
             raise InstallationFailed("".join(rows))
         return "".join(rows)
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 import time
-from typing import Protocol
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import IO, Protocol
 
 _QUIET_S = 10.0
 
@@ -25,7 +28,7 @@ class Progress:
         self._start = self._last = time.monotonic()
 
     def step(self, text: str) -> None:
-        """Say what happens now."""
+        """Show a step that begins."""
         self._last = time.monotonic()
         self._write(f"{self._line(text)}\n")
 
@@ -38,7 +41,7 @@ class Progress:
             self.step(f"  {text}")
 
     def fail(self, text: str) -> None:
-        """Say what ended it."""
+        """Show the error that ended the work."""
         self._write(f"{text}\n")
 
     def _line(self, text: str) -> str:
@@ -48,3 +51,40 @@ class Progress:
         clear = "\r\x1b[K" if self._is_terminal else ""
         self._stream.write(clear + text)
         self._stream.flush()
+
+
+def run_logged(
+    command: Sequence[str],
+    log: Path,
+    show: Callable[[str], object],
+    *,
+    environ: Mapping[str, str],
+    folder: Path | None = None,
+    given: IO[bytes] | None = None,
+) -> int:
+    """Run a program, append its output to a log, and show each line; returns its exit code.
+
+    ``given`` is its standard input. Raises ``OSError``: if it cannot be started, or the log not
+    written.
+    """
+    with (
+        log.open("a", encoding="utf-8") as file,
+        subprocess.Popen(
+            command,
+            cwd=folder,
+            env=environ,
+            stdin=given or subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            encoding="utf-8",
+            errors="replace",
+        ) as program,
+    ):
+        try:
+            for line in program.stdout or ():
+                file.write(line)
+                show(line)
+        except BaseException:  # Ctrl+C, above all
+            program.terminate()
+            raise
+    return program.returncode

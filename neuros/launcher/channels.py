@@ -23,16 +23,18 @@ import neuros.control as control
 from neuros.control import Message
 from neuros.control.link import ControlLink, encode
 from neuros.errors import ControlError
-from neuros.launcher.outcome import Outcome, Phase, SupervisorOutput
+from neuros.launcher.outcome import Outcome, Phase
 from neuros.ports import ControlListener
 
 STRANGER = "an unknown program"
 _MOST_UNSENT_BYTES = 1 << 20
+_LEFT_OUT = control.GetStatus, control.NodeStatus, control.LogRecord
+"""Messages that are left out while so much waits to be sent."""
 _READS_AT_A_TIME = 64
 _WAKING_BYTES = 1024
 
-_FIRST_LOOK_S = 0.0005
-_RAREST_LOOK_S = 0.02
+_FIRST_CHECK_S = 0.0005
+_RAREST_CHECK_S = 0.02
 _LOST_AFTER_S = 0.1
 """On a connection that may lose packets, one that has not arrived for so long has been lost."""
 _NEVER_S = 3600.0
@@ -59,7 +61,7 @@ class Channels:
         self._waker: socket.socket | None = None
 
     def wake_on(self, waker: socket.socket) -> None:
-        """Let :meth:`wait` return, too, when bytes arrive here; they mean nothing by themselves."""
+        """Have :meth:`wait` return when bytes arrive on ``waker``, too; they are dropped."""
         waker.setblocking(False)
         self._waker = waker
         self._selector.register(waker, selectors.EVENT_READ)
@@ -120,7 +122,7 @@ class Channels:
         if link not in self._links:
             return
         is_full = len(link.unsent) >= _MOST_UNSENT_BYTES
-        if is_full and isinstance(message, control.Look | control.NodeStatus | control.LogRecord):
+        if is_full and isinstance(message, _LEFT_OUT):
             return
         link.unsent += encode(message)
         link.flush()
@@ -139,7 +141,7 @@ class Channels:
             link.flush()
 
     def hang_up(self, link: ControlLink) -> None:
-        """Neither send to this one nor hear it any more."""
+        """Close the connection."""
         if link in self._links:
             del self._links[link]
             self._selector.unregister(link)
@@ -157,7 +159,7 @@ class Channels:
         return {key.fileobj for key, _ in self._selector.select(timeout_s)}
 
     def _read(self, link: ControlLink) -> Iterator[tuple[ControlLink, Message | ControlError]]:
-        """All that a node process has said; of any other program, what comes first."""
+        """All messages of a node process; of another program, those of one read."""
         for _ in range(_READS_AT_A_TIME):
             if link not in self._links:
                 return
@@ -169,28 +171,25 @@ class Channels:
                 yield link, error
                 return
             for data in found or ():
-                yield link, self._message_in(data, link)
+                try:
+                    message = link.decode(data)
+                except ControlError as error:
+                    yield link, error
+                    continue
+                if isinstance(message, control.Hello):
+                    self._nodes[link] = tuple(message.nodes)
+                    link.accept(control.FROM_NODES)
+                    link.peer = f"the process of {' and '.join(message.nodes)}"
+                elif isinstance(message, control.Watch):
+                    link.accept(control.FROM_OBSERVERS)
+                    link.peer = "an observer"
+                yield link, message
             if found is None:
                 if link in self._nodes:
                     self.parted[self._nodes[link]] = time.monotonic()
                 self.hang_up(link)
             if link not in self._nodes:
                 return
-
-    def _message_in(self, data: bytes, link: ControlLink) -> Message | ControlError:
-        """The message, after which it is known who is at the other end; else why there is none."""
-        try:
-            message = link.decode(data)
-        except ControlError as error:
-            return error
-        if isinstance(message, control.Hello):
-            self._nodes[link] = tuple(message.nodes)
-            link.accept(control.FROM_NODES)
-            link.peer = f"the process of {' and '.join(message.nodes)}"
-        elif isinstance(message, control.Watch):
-            link.accept(control.FROM_OBSERVERS)
-            link.peer = "an observer"
-        return message
 
 
 @dataclass
@@ -219,13 +218,13 @@ class PauseState:
         return self._before_s + (0.0 if self.since_s is None else self.clock() - self.since_s)
 
     def begin(self) -> None:
-        """Let no hook start."""
+        """Pause all nodes."""
         if self.since_s is None:
             self.since_s = self.clock()
             self.send(control.Pause())
 
     def end(self) -> None:
-        """Let the run go on."""
+        """Resume all nodes."""
         if self.since_s is not None:
             self.forget()
             self.send(control.Resume())
@@ -235,7 +234,7 @@ class PauseState:
         self._before_s, self.since_s = self.total_s, None
 
     def step(self, count: int, *, is_driven: bool) -> None:
-        """Let a paused run do so many steps."""
+        """Run ``count`` steps of a paused run."""
         if self.since_s is not None and count > 0:
             self.send(control.Step(count, is_driven))
 
@@ -260,8 +259,8 @@ class Observers:
     _told: control.PhaseChanged | None = None
     _asked: dict[int, Mapping[str, Mapping[str, Any]]] = field(default_factory=dict)
 
-    def take(self, link: ControlLink, message: Message) -> None:
-        """Take a message from or for an observer.
+    def receive(self, link: ControlLink, message: Message) -> None:
+        """Handle a message from or for an observer.
 
         Raises:
             ControlError: if it is a packet for what is no session's input; nothing has changed.
@@ -271,7 +270,7 @@ class Observers:
                 self._count += 1
                 self._links[self._count] = link
                 self._told = None
-            case control.LookAll(wanted):
+            case control.GetStatus(wanted):
                 for number, each in self._links.items():
                     if each is link:
                         self._asked[number] = wanted
@@ -298,7 +297,7 @@ class Observers:
                 self._channels.send_to_node(node, message)
             case control.Change(node):
                 self._channels.send_to_node(node, message)
-            case control.StepAll(count):
+            case control.Step(count):
                 self._pause.step(count, is_driven=self._is_driven())
             case control.End(reason):
                 self._end(reason)
@@ -308,13 +307,14 @@ class Observers:
         for link in self._links.values():
             self._channels.send_to(link, message)
 
-    def look_at(self, phase: Phase) -> None:
-        """Ask nodes what they want to see, tell them of a change of phase; end a lonely pause.
+    def update(self, phase: Phase) -> None:
+        """Ask nodes for the statuses that observers want, and send these a change of phase.
 
-        One that has asked several times since is answered once.
+        An observer that has asked several times since is answered once. When the last observer has
+        gone, a paused run goes on.
         """
         for number, wanted in self._asked.items():
-            self._channels.send(control.Look(wanted, number))
+            self._channels.send(control.GetStatus(wanted, number))
         self._asked.clear()
         if phase is not Phase.RUNNING and self._pause.is_on:
             self._pause.forget()
@@ -328,8 +328,8 @@ class Observers:
             self._told = now
             self.tell(now)
 
-    def part(self, outcome: Outcome) -> None:
-        """Tell them how the run has ended."""
+    def end(self, outcome: Outcome) -> None:
+        """Send observers the end of the run."""
         self.tell(
             control.Ended(
                 outcome.exit_code,
@@ -342,26 +342,11 @@ class Observers:
         )
 
 
-@dataclass
-class Overheard:
-    """An output for people whose records observers get, too."""
-
-    _output: SupervisorOutput
-    _tell: Callable[[Message], object]
-
-    def log(self, severity: str, text: str) -> None:
-        self._output.log(severity, text)
-        self._tell(control.LogRecord(severity, text))
-
-    def poll(self) -> object:
-        return self._output.poll()
-
-
 Counts: TypeAlias = Mapping[str, tuple[int, int]]
 """By connection, packets that have passed, and those acknowledged; -1: none ever are."""
 
 
-class Settling:
+class RestDetector:
     """Answers ``advance`` of a session: once all nodes are active, and nothing moves.
 
     The run is paused: this is the end of a step. Each node process answers when no event waits in
@@ -394,7 +379,7 @@ class Settling:
 
     @property
     def wait_s(self) -> float:
-        """Seconds until :meth:`look` has something to do."""
+        """Seconds until :meth:`check` has something to do."""
         return _NEVER_S if self._due_s is None else max(0.0, self._due_s - self._clock())
 
     def ask(self, asker: ControlLink, message: control.Advance) -> None:
@@ -405,12 +390,12 @@ class Settling:
         self._begin_round()
 
     def give_up(self, asker: ControlLink) -> None:
-        """This one lets the run go on, and waits for no answer any more."""
+        """This session resumes the run, and waits for no answer any more."""
         if asker is self._asker:
             self._asker = self._due_s = None
 
-    def take(self, answer: control.AtRest) -> None:
-        """Take an answer of a process, perhaps to the last round."""
+    def add(self, answer: control.AtRest) -> None:
+        """An answer of a process has arrived, perhaps to the last round."""
         if answer.number != self._round or self._asker is None:
             return
         self._answers[answer.nodes] = answer
@@ -420,7 +405,7 @@ class Settling:
         if {name for names in self._answers for name in names} == self._names:
             self._judge(self._asker)
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Ask again where it is time."""
         if self._due_s is not None and self._clock() >= self._due_s:
             self._begin_round()
@@ -436,7 +421,7 @@ class Settling:
         self._channels.send(control.Advance(self._round, 0, {**self._asked.known, **known}))
 
     def _ask_later(self) -> None:
-        self._pause_s = min(max(2 * self._pause_s, _FIRST_LOOK_S), _RAREST_LOOK_S)
+        self._pause_s = min(max(2 * self._pause_s, _FIRST_CHECK_S), _RAREST_CHECK_S)
         self._due_s = self._clock() + self._pause_s
 
     def _judge(self, asker: ControlLink) -> None:

@@ -15,7 +15,7 @@ LEAVE_S = 5.0
 _LOOK_S = 1.0
 
 
-class Finalising:
+class FinaliseTimes:
     """How long the nodes of each process have made no progress since the end began.
 
     A hook that ends, ``node.progress`` and a file that grows in the folder of a node are progress.
@@ -41,26 +41,26 @@ class Finalising:
         self._left[node] = list(hooks)
 
     def begin(self, now_s: float) -> None:
-        """The nodes have been told to end."""
+        """The nodes have been asked to end."""
         for name in self.limits_s:
             self._moved_s.setdefault(name, now_s)
             self._looked_s.setdefault(name, now_s)  # what nodes write as they are told is no news
 
-    def excuse(self, still_s: float) -> None:
+    def shift(self, still_s: float) -> None:
         """The run stood still for so long."""
         self._moved_s = {name: moved_s + still_s for name, moved_s in self._moved_s.items()}
 
-    def note_progress(self, node: str, now_s: float) -> None:
+    def advance(self, node: str, now_s: float) -> None:
         """A node has made progress."""
         self._moved_s[node] = now_s
 
-    def note_hook(self, node: str, hook: str | None, now_s: float) -> None:
+    def enter(self, node: str, hook: str | None, now_s: float) -> None:
         """A node starts a finalise hook; ``""``: it closes what it holds; ``None``: it is done."""
         self._hooks[node] = hook
         if hook and hook in self._left.get(node, ()):
             self._left[node].remove(hook)
         self._since_s[node] = now_s
-        self.note_progress(node, now_s)
+        self.advance(node, now_s)
 
     def has_begun(self, names: Sequence[str]) -> bool:
         """Whether a process with these nodes runs no hook any more but finalise hooks."""
@@ -75,7 +75,7 @@ class Finalising:
         current = self.current(names)
         waiting = [current] if current else names
         for name in waiting:
-            self._look_at_files(name, now_s)
+            self._check_files(name, now_s)
         return max(self._moved_s[name] + self.limits_s[name] for name in waiting) - now_s
 
     def unfinished(self, node: str) -> list[str]:
@@ -93,26 +93,22 @@ class Finalising:
         return clauses
 
     def remarks(self, now_s: float) -> Iterator[str]:
-        """What takes long now, each once."""
+        """Sentences about nodes that have finalised for a second, each once."""
         for node, hook in self._hooks.items():
             is_long = hook is not None and now_s - self._since_s[node] >= SAVING_S
             if hook is not None and is_long and (node, hook) not in self._named:
                 self._named.add((node, hook))
                 yield f"saving: '{node}' ({f'finalise hook {hook!r}' if hook else 'closing'})"
 
-    def _look_at_files(self, node: str, now_s: float) -> None:
+    def _check_files(self, node: str, now_s: float) -> None:
         """Count it as progress if a file of the node has grown since the last look."""
         if now_s - self._looked_s.get(node, 0.0) < min(_LOOK_S, self.limits_s[node] / 4):
             return
         self._looked_s[node] = now_s
         before, now = self._sizes.get(node), _sizes(self._run_folder / node)
         self._sizes[node] = now
-        if before is not None and _has_grown(before, now):
-            self.note_progress(node, now_s)
-
-
-def _has_grown(before: Mapping[str, int], now: Mapping[str, int]) -> bool:
-    return any(size > before.get(path, -1) for path, size in now.items())
+        if before is not None and any(now[path] > before.get(path, -1) for path in now):
+            self.advance(node, now_s)
 
 
 def _sizes(folder: Path) -> dict[str, int]:

@@ -34,8 +34,9 @@ class SupervisorOutput(Protocol):
 
 
 class Phase(Enum):
-    """The phases of a run."""
+    """The phases of a run; it runs once every node has initialised."""
 
+    STARTING = "starting"
     RUNNING = "running"
     DRAINING = "draining"
     STOPPING = "stopping"
@@ -140,7 +141,7 @@ class Outcome:
         start_s, end = ending_s - running_s - paused_s, (times[owner], ending_s)
         return _advance(self.timelines.get(owner, ()), start_s, end) / running_s
 
-    def take(self, report: Report, now_s: float) -> None:
+    def add(self, report: Report, now_s: float) -> None:
         """Keep a report, unless the node has made its final one."""
         name = report.node
         if not self.has_final_report(name):
@@ -150,7 +151,7 @@ class Outcome:
             self.timelines.setdefault(name, []).extend(report.timeline)
             self.report_times_s[name] = now_s
 
-    def excuse(self, still_s: float) -> None:
+    def shift(self, still_s: float) -> None:
         """The launcher stood still for so long, and perhaps the nodes: their reports are as new."""
         self.report_times_s = {n: at_s + still_s for n, at_s in self.report_times_s.items()}
 
@@ -183,7 +184,7 @@ class Outcome:
 def _advance(
     timeline: Sequence[Sequence[float]], start_s: float, end: tuple[float, float]
 ) -> float:
-    """The simulated time that has passed since a wall time; what a reset takes back has passed."""
+    """The simulated seconds since a wall time; a reset takes none of them back."""
     after = bisect_right(timeline, start_s, key=lambda point: point[1])
     points = [(_simulated(timeline, start_s), start_s), *timeline[after:], end]
     return sum(max(0.0, later[0] - earlier[0]) for earlier, later in pairwise(points))
@@ -206,13 +207,14 @@ class Processes:
     """Processes that the back end has started, judged by the reports of their nodes.
 
     Attributes:
-        killed: the names of all nodes whose processes were killed, or are to be.
+        failed: the nodes that have reported that they failed: their processes may end.
+        killed: the nodes whose processes were killed, or are to be.
     """
 
     _detector: StallDetector
     _outcome: Outcome
     _running: list[RunningNode] = field(default_factory=list)
-    _has_told_failure: set[str] = field(default_factory=set)
+    failed: set[str] = field(default_factory=set)
     killed: set[str] = field(default_factory=set)
 
     def add(self, started: Sequence[RunningNode]) -> None:
@@ -224,10 +226,6 @@ class Processes:
 
     def __iter__(self) -> Iterator[RunningNode]:
         return iter(tuple(self._running))
-
-    def note_failure(self, name: str) -> None:
-        """A node has told that it failed: its process may end now."""
-        self._has_told_failure.add(name)
 
     def ended(self) -> list[tuple[RunningNode, str]]:
         """Processes that have ended since the last call, and how."""
@@ -244,15 +242,10 @@ class Processes:
         """The process with a node, if it runs."""
         return next((each for each in self._running if name in each.names), None)
 
-    def have_reported(self) -> bool:
-        """Whether every node has made its final report, but for those that were killed."""
-        names = {name for process in self._running for name in process.names}
-        return all(map(self._outcome.has_final_report, names - self.killed))
-
     def may_end(self, process: RunningNode, *, is_stopping: bool) -> bool:
-        """Whether it was asked to end and has told its last, or has failed and said so."""
+        """Whether its nodes have made their final reports, or have reported a failure."""
         names = set(process.names)
-        if names <= self.killed or names & self._has_told_failure:
+        if names <= self.killed or names & self.failed:
             return True
         return is_stopping and all(map(self._outcome.has_final_report, names))
 
@@ -269,7 +262,7 @@ class Processes:
 
     def how_it_left(self, process: RunningNode, how: str) -> str:
         """One sentence about a process that ended badly after its final report, else empty."""
-        if how == "exit code 0" or {*process.names} & (self.killed | self._has_told_failure):
+        if how == "exit code 0" or {*process.names} & (self.killed | self.failed):
             return ""
         return f"the process of {nodes_of(process)} ended badly after its final report: {how}"
 

@@ -1,8 +1,8 @@
 """Launchers that run parts of one project: their states, and the common end.
 
 The launchers are *peers*, and meet through their nodes alone: each publishes its
-:class:`PeerState` through its nodes, and hears those of its peers. So peers can start in any order;
-each knows for which it still waits; and the end of one is the end of all.
+:class:`PeerState` through its nodes, and receives those of its peers. So peers can start in any
+order; each knows for which it still waits; and the end of one is the end of all.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def count(
     return None if found is None else int(found)
 
 
-class End(NamedTuple):
+class EndElsewhere(NamedTuple):
     """The end of the project elsewhere: its exit code, its reason, and for how long it drains."""
 
     exit_code: int
@@ -121,7 +121,7 @@ class End(NamedTuple):
 
 
 class Peers:
-    """The peers of this launcher, and what it tells them.
+    """The peers of this launcher: their states, and its own.
 
     Args:
         run: marks this run.
@@ -149,7 +149,7 @@ class Peers:
         )
         self._missing = set(elsewhere)
         self._found: list[str] = []
-        self._say: Callable[[str], object] = lambda _: None
+        self._send: Callable[[str], object] = lambda _: None
         self._own = PeerState(run, socket.gethostname())
         self._others: dict[str, PeerState] = {}
         self._run_of: dict[str, str] = {}
@@ -158,11 +158,11 @@ class Peers:
         self._give_up_s: float | None = None
         self._over_s: float | None = None
 
-    # ------------------------------------------------------------------ speaking
+    # ------------------------------------------------------------------ own state
 
-    def speak_through(self, say: Callable[[str], object]) -> None:
-        """Have nodes say what there is to say by ``say(text)``."""
-        self._say = say
+    def publish_through(self, send: Callable[[str], object]) -> None:
+        """Have nodes publish the states of this launcher by ``send(text)``."""
+        self._send = send
 
     @property
     def exist(self) -> bool:
@@ -175,19 +175,19 @@ class Peers:
         return self._own.to_text()
 
     def reach(self, stage: Stage) -> None:
-        """The nodes here have come so far in their start."""
+        """The nodes here have reached a stage of the start."""
         if self._own.stage < stage:
-            self._utter(stage=stage)
+            self._publish(stage=stage)
 
     def have_reached(self, stage: Stage) -> bool:
-        """Whether every node elsewhere has come so far."""
+        """Whether every node elsewhere has reached this stage."""
         return not self._behind(stage)
 
     def drain(self, reason: str, drain_s: float) -> None:
         """The run here drains."""
-        self._utter(phase=DRAINING, drain_s=drain_s, **self._because(reason, 0))
+        self._publish(phase=DRAINING, drain_s=drain_s, **self._because(reason, 0))
 
-    def settle(self, probes: Mapping[str, Report]) -> bool:
+    def agree_on_end(self, probes: Mapping[str, Report]) -> bool:
         """The run here is drained by itself; returns whether peers agree, and nothing is under way.
 
         Others count it as drained only while the counters of both ends are equal. A packet under
@@ -195,29 +195,29 @@ class Peers:
         """
         counters = counters_of(probes, self._crossing)
         if (self._own.phase, self._own.counters) != (DRAINED, counters):
-            self._utter(phase=DRAINED, counters=counters)
+            self._publish(phase=DRAINED, counters=counters)
         return all(self._agrees(each) for each in self._others.values() if each.has_just_begun)
 
-    def unsettle(self) -> None:
-        """There is still something to do here."""
+    def go_on(self) -> None:
+        """A node here still has something to do."""
         if self._own.phase == DRAINED:
-            self._utter(phase=DRAINING)
+            self._publish(phase=DRAINING)
 
     def stop(self, exit_code: int, reason: str) -> None:
         """The run here stops."""
-        self._utter(phase=STOPPING, **self._because(reason, exit_code))
+        self._publish(phase=STOPPING, **self._because(reason, exit_code))
 
     def finish(self, reports: Mapping[str, Report], now_s: float) -> bool:
         """No node here runs hooks any more; returns whether they may go."""
         if self._over_s is None:
             self._over_s = now_s
-            self._utter(phase=OVER, counters=counters_of(reports, self._crossing))
+            self._publish(phase=OVER, counters=counters_of(reports, self._crossing))
         return not self._unfinished() or now_s - self._over_s >= _PATIENCE_S
 
-    # ------------------------------------------------------------------ hearing
+    # ------------------------------------------------------------------ states of others
 
-    def hear(self, node: str, text: str | None, now_s: float) -> None:
-        """A node elsewhere has said something, or is gone."""
+    def receive(self, node: str, text: str | None, now_s: float) -> None:
+        """A node elsewhere has published a state, or is gone (``None``)."""
         if text is None:
             if node in self._run_of:
                 self._gone_s.setdefault(node, now_s)
@@ -236,13 +236,13 @@ class Peers:
         if state.run not in self._others or state.number > self._others[state.run].number:
             self._others[state.run] = state
 
-    def end(self, now_s: float) -> End | None:
+    def end(self, now_s: float) -> EndElsewhere | None:
         """The end of the project elsewhere, if there is one."""
         for node, gone_s in self._gone_s.items():
             state = self._others[self._run_of[node]]
             if not state.is_ending and now_s - gone_s >= _GRACE_S:
                 machine = state.machine
-                return End(
+                return EndElsewhere(
                     1,
                     f"node '{node}' on {machine} is gone: it was killed, or {machine} or the"
                     " network to it is down",
@@ -253,7 +253,7 @@ class Peers:
             return None
         worst = max(ending, key=lambda state: state.exit_code)
         reason = f"the project ended elsewhere ({worst.origin}): {worst.reason}"
-        return End(worst.exit_code, reason, worst.drain_s)
+        return EndElsewhere(worst.exit_code, reason, worst.drain_s)
 
     def counters(self) -> Mapping[str, Mapping[str, Any]]:
         """Counters of nodes elsewhere on connections to here, of peers that are over."""
@@ -288,17 +288,17 @@ class Peers:
     # ------------------------------------------------------------------ inside
 
     def _behind(self, stage: int) -> list[str]:
-        """The nodes elsewhere that have not come so far."""
+        """The nodes elsewhere that have not reached this stage."""
         found = {name: self._others[run].stage for name, run in self._run_of.items()}
         return [name for name in self._elsewhere if found.get(name, -1) < stage]
 
     def _names(self) -> str:
         return ", ".join(sorted(self._missing))
 
-    def _utter(self, **changes: Any) -> None:
+    def _publish(self, **changes: Any) -> None:
         if self._elsewhere:
             self._own = replace(self._own, number=self._own.number + 1, **changes)
-            self._say(self.own_state)
+            self._send(self.own_state)
 
     def _because(self, reason: str, exit_code: int) -> dict[str, Any]:
         """The cause of the end; the first one stays, and where it is known from elsewhere."""
@@ -308,7 +308,7 @@ class Peers:
         return {"reason": reason, "origin": self._own.machine, "exit_code": exit_code}
 
     def _unfinished(self) -> bool:
-        """Whether a peer that is there has not said what it has counted in all."""
+        """Whether a peer that is there has not published its final counters."""
         gone = {self._run_of[node] for node in self._gone_s}
         return any(s.phase != OVER and s.run not in gone for s in self._others.values())
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from enum import Enum
-from typing import Any
+from typing import Any, TypeVar
 
 from neuros.control import (
     HookDeclaration,
@@ -39,6 +39,8 @@ _DRAINING_PAUSE_S = 0.01
 _RUNNING_PAUSE_S = DEADLOCK_AFTER_S / 2
 _LONGEST_PAUSE_S = 2.0
 _BUSY_S = 0.1
+
+_T = TypeVar("_T")
 
 Probes = Mapping[str, Probed]
 """The newest probe by node."""
@@ -93,14 +95,14 @@ class Probing:
         self.verdict = Verdict.UNDECIDED if self._names else Verdict.DRAINED
         self._ask(now_s)
 
-    def take(self, probe: Probed) -> None:
-        """Take an answer, perhaps to the last probe."""
+    def add(self, probe: Probed) -> None:
+        """An answer has arrived, perhaps to the last probe."""
         if probe.number == self._number and probe.node in self._names:
             self._probes[probe.node] = probe
             if len(self._probes) == len(self._names):
                 self._judge()
 
-    def look(self, now_s: float, rested_s: float) -> Verdict:
+    def check(self, now_s: float, rested_s: float) -> Verdict:
         """Ask again where it is time; ``rested_s`` is for how long nothing has moved."""
         pause_s = now_s - self._asked_s
         if self._is_draining:
@@ -121,7 +123,7 @@ class Probing:
         others = {other for why in found.values() for other in why}
         if not others:
             cures = "If the work is done, let a hook call node.shutdown"
-        elif not any(_ring_through(node, found) for node in found):
+        elif not any(_ring_through(node, _waited_for(found)) for node in found):
             ends = sorted(others - {node for node, why in found.items() if why})
             cures = (
                 f"No hook of {' or '.join(ends)} is left to run: let one send or take what is"
@@ -164,10 +166,10 @@ class Probing:
             this_round = counters(probes)
             is_over, verdict = is_dead(probes, connections), Verdict.DEAD
         is_stable, self._last_round = this_round == self._last_round, this_round
-        if is_over and is_stable and (self._peers is None or self._peers.settle(probes)):
+        if is_over and is_stable and (self._peers is None or self._peers.agree_on_end(probes)):
             self.verdict = verdict
         elif self._peers is not None and not (is_over and is_stable):
-            self._peers.unsettle()
+            self._peers.go_on()
 
 
 def connections_among(files: Sequence[NodeFile]) -> list[Connection]:
@@ -263,26 +265,33 @@ def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[s
 
 def cycle(waits: Waits) -> list[tuple[str, str]]:
     """A smallest ring of nodes that wait for each other, as ``(node, why)``; else every wait."""
-    rings = [ring for node in sorted(waits) if (ring := _ring_through(node, waits))]
+    rings = [ring for node in sorted(waits) if (ring := _ring_through(node, _waited_for(waits)))]
     if not rings:
         return [(node, next(iter(why.values()))) for node, why in sorted(waits.items()) if why]
     ring = min(rings, key=len)
     return [(a, waits[a][b]) for a, b in zip(ring, [*ring[1:], ring[0]], strict=True)]
 
 
-def _ring_through(start: str, waits: Waits) -> list[str]:
-    """The shortest way from a node back to itself (breadth first); empty if there is none."""
+def _waited_for(waits: Waits) -> Callable[[str], Iterable[str]]:
+    return lambda node: sorted(waits.get(node, ()))
+
+
+def _ring_through(start: _T, following: Callable[[_T], Iterable[_T]]) -> list[_T]:
+    """The shortest way from a member of a graph back to itself; empty if there is none.
+
+    ``following`` gives the members that one leads to.
+    """
     paths = [[start]]
-    seen: set[str] = set()
-    while paths:
+    seen: set[_T] = set()
+    while paths:  # breadth first
         longer = []
         for path in paths:
-            for node in sorted(waits.get(path[-1], ())):
-                if node == start:
+            for each in following(path[-1]):
+                if each == start:
                     return path
-                if node not in seen:
-                    seen.add(node)
-                    longer.append([*path, node])
+                if each not in seen:
+                    seen.add(each)
+                    longer.append([*path, each])
         paths = longer
     return []
 
@@ -333,8 +342,8 @@ class Declarations:
         }
         self._hooks: dict[str, list[DeclaredHook]] = {}
 
-    def take(self, message: Hooks) -> None:
-        """Take the declarations of a node."""
+    def add(self, message: Hooks) -> None:
+        """Keep the declarations of a node, in the place of those before its reset."""
         node = message.node
         self._hooks[node] = [
             DeclaredHook(hook.kind, hook.inputs, hook.outputs, node, place)
@@ -425,21 +434,8 @@ def last_round(
         (
             hook
             for hook in endless
-            if _is_in_ring(hook, before)
+            if _ring_through(hook, before.__getitem__)
             or (hook.outputs and any((hook.node, port.name) in external for port in hook.required))
         ),
         key=lambda hook: (hook.node, hook.place),
     )
-
-
-def _is_in_ring(start: DeclaredHook, before: Mapping[DeclaredHook, set[DeclaredHook]]) -> bool:
-    """Whether a hook requires, through others, what it sends itself."""
-    seen: set[DeclaredHook] = set()
-    ahead = [start]
-    while ahead:
-        for hook in before[ahead.pop()] - seen:
-            if hook == start:
-                return True
-            seen.add(hook)
-            ahead.append(hook)
-    return False

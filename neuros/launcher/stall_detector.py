@@ -15,7 +15,7 @@ from neuros.project.model import Connection
 from neuros.stacks import IMPORT, LONG_S, ProcessThreads, Stack
 
 STALL_S = 5.0
-"""After this long, nodes are asked why nothing moves."""
+"""After this long, the user is told why nothing moves."""
 
 SILENT_S = 2.0
 """A node that has not reported for this long reports no more, or not in time."""
@@ -38,6 +38,10 @@ class StallDetector:
         names: the nodes.
         now_s: the time now; all times are seconds on one monotonic clock.
         reader: reads where the threads of processes stand.
+
+    Attributes:
+        loaded: the nodes whose plugins have been imported.
+        ready: the nodes that have initialised as far as they can alone.
     """
 
     def __init__(self, names: Sequence[str], now_s: float, reader: ThreadReader) -> None:
@@ -46,8 +50,8 @@ class StallDetector:
         self._processes: dict[str, tuple[str, ...]] = {}  # by node, all nodes of its process
         self._plugins: dict[str, str] = {}
         self._silent = set(names)
-        self._loaded: set[str] = set()
-        self._ready: set[str] = set()
+        self.loaded: set[str] = set()
+        self.ready: set[str] = set()
         self._reports: dict[str, Report] = {}
         self._heard_s: dict[str, float] = {}
         self._moved: dict[str, Any] = {}
@@ -70,7 +74,7 @@ class StallDetector:
                 self._plugins[name] = plugins[name]
 
     def report(self, report: Report, now_s: float) -> None:
-        """Take a report."""
+        """Add a report."""
         name, metrics = report.node, report.metrics
         self._reports[name] = report
         self._heard_s[name] = now_s
@@ -95,16 +99,8 @@ class StallDetector:
             self._starving[name] = lacks, now_s
 
     def is_greeted(self, name: str) -> bool:
-        """Whether the process of a node has said hello."""
+        """Whether the process of a node has connected."""
         return name not in self._silent
-
-    def note_loaded(self, name: str) -> None:
-        """The plugin of a node has been imported."""
-        self._loaded.add(name)
-
-    def note_ready(self, name: str) -> None:
-        """A node has initialised as far as it can alone."""
-        self._ready.add(name)
 
     def has_begun(self, name: str) -> bool:
         """Whether a node may run hooks."""
@@ -127,8 +123,8 @@ class StallDetector:
         self._has_explained = False
         self._starving.clear()
 
-    def excuse(self, still_s: float) -> None:
-        """Nobody could be heard for so long: that is no silence and no standstill of a node."""
+    def shift(self, still_s: float) -> None:
+        """The launcher stood still for so long: that was no silence or standstill of a node."""
         self._heard_s = {name: heard_s + still_s for name, heard_s in self._heard_s.items()}
         self._moved_s += still_s
         self._next_remark_s += still_s
@@ -157,6 +153,13 @@ class StallDetector:
         self._has_explained = True
         return True
 
+    def reasons(self, now_s: float) -> Iterator[tuple[str, str]]:
+        """Why nothing moves, by node; of a process that executes a hook, that is the reason."""
+        for name, report in sorted(self._reports.items()):
+            is_executing = any(map(self._executing, self._together(name)))
+            if report.reasons and not is_executing and self.silent_s(name, now_s) < SILENT_S:
+                yield "WARN", f"{name} {'; '.join(report.reasons)}"
+
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
         """Remarks for the user now, as ``(severity, text)``."""
         if now_s >= self._next_remark_s:
@@ -164,22 +167,18 @@ class StallDetector:
             if self._silent:
                 yield "INFO", f"still starting: {', '.join(sorted(self._silent))}"
             early = [name for name in sorted(self._reports) if not self.has_begun(name)]
-            if loading := [name for name in early if name not in self._loaded]:
+            if loading := [name for name in early if name not in self.loaded]:
                 yield "INFO", f"still importing their plugins: {', '.join(loading)}"
             if waiting := self._waiting():
                 yield "INFO", f"connections still waiting for their other end: {'; '.join(waiting)}"
-            elif self.is_complete and not self._ready.issuperset(self._names):
-                initialising = [name for name in self._names if name not in self._ready]
+            elif self.is_complete and not self.ready.issuperset(self._names):
+                initialising = [name for name in self._names if name not in self.ready]
                 yield "INFO", f"still initialising: {', '.join(initialising)}"
             elif self.is_complete and self.rested_s(now_s) < STALL_S:  # else nodes are asked
-                yield from self._remarks_on_starving(now_s)
-
-    def _remarks_on_starving(self, now_s: float) -> Iterator[tuple[str, str]]:
-        """Nodes that have never got what they wait for, while others move."""
-        for name, (lacks, since_s) in self._starving.items():
-            if now_s - since_s >= STALL_S and (name, lacks) not in self._named_as_starving:
-                self._named_as_starving.add((name, lacks))
-                yield "INFO", f"{name} still waits for {lacks}, where nothing has ever come"
+                for name, (lacks, since_s) in self._starving.items():
+                    if now_s - since_s >= STALL_S and (name, lacks) not in self._named_as_starving:
+                        self._named_as_starving.add((name, lacks))
+                        yield "INFO", f"{name} still waits for {lacks}, where nothing has ever come"
 
     def remarks_on_hooks(self) -> Iterator[tuple[str, str]]:
         """Hooks that run for long, each once, with their stacks."""
@@ -217,9 +216,9 @@ class StallDetector:
                 yield "WARN", remark
 
     def _remark_on_import(self, names: Sequence[str], read: ProcessThreads) -> str:
-        """What a process does whose main thread lets no other run before its nodes have begun."""
+        """A sentence about a process whose main thread, as it imports, lets no other thread run."""
         holder = read.lock_holder
-        loading = [n for n in names if n not in self._loaded and not self.has_begun(n)]
+        loading = [n for n in names if n not in self.loaded and not self.has_begun(n)]
         stacks = filter(None, map(self._read_stack, names))
         if not (holder and holder.is_main and loading) or read.stopped:
             return ""
@@ -234,7 +233,7 @@ class StallDetector:
         )
 
     def _remark_on(self, names: Sequence[str], read: ProcessThreads) -> str:
-        """Why a process with these nodes does not report; empty if that has been said."""
+        """Why a process with these nodes does not report; empty if its hook was named before."""
         holder = read.lock_holder
         if holder and holder.is_main and not read.stopped:
             for stack in filter(None, map(self._read_stack, names)):
@@ -369,7 +368,7 @@ class Backlog:
         self._named: set[str] = set()
 
     def report(self, report: Report, now_s: float) -> None:
-        """Take a report of a node."""
+        """Add a report of a node."""
         metrics = report.metrics
         if metrics is None:
             return

@@ -39,7 +39,7 @@ class ThreadReader:
             self._begun = [*filter(threading.Thread.is_alive, self._begun), thread]
 
     def forget(self, name: str) -> None:
-        """The process goes on: what was read of it is past."""
+        """Drop what was read of a process, since it goes on."""
         self._readings.pop(name, None)
 
     def read(self, name: str) -> ProcessThreads | None:

@@ -2,7 +2,8 @@
 
 The grammar is that of rosidl (https://docs.ros.org/en/jazzy/Concepts/Basic/About-Interfaces.html),
 and rosidl's parser judges each line. The parser stops at the first mistake and knows no line
-numbers: so each line is parsed by itself, and its errors are put into other words.
+numbers: so each line is parsed by itself, and its errors are put into other words. What rosidl
+parses, but cannot generate or compile, is a mistake, too.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from rosidl_adapter.parser import (
 from neuros.errors import Problem
 from neuros.messages.package import MANIFEST, Package, problem_at
 from neuros.messages.workspace import Workspaces
+from neuros.project.message_types import similar_package
 from neuros.project.suggest import did_you_mean
 
 _PARTS = {".msg": 1, ".srv": 2, ".action": 3}
@@ -97,18 +99,27 @@ def _unknown(package: Package, file: Path, use: Use, workspaces: Workspaces) -> 
     if messages is None:
         known = {*workspaces.packages, *workspaces.ros.message_packages()}
         text = f"found '{use.type}', expected a message of a package that is here"
-        hint = did_you_mean(of, known) or f"there is no package '{of}'"
+        similar = similar_package(of, known) or f"there is no package '{of}'."
+        hint = f"{similar} If '{of}' exists, put it into the workspace, too"
     elif name not in messages:
-        text, hint = (
-            f"found '{use.type}', expected a message of '{of}'",
-            did_you_mean(name, messages),
-        )
-    elif of != package.name and of not in package.dependencies:
-        text = f"found '{use.type}', expected <depend>{of}</depend> in {MANIFEST}"
-        hint = "colcon would not find it either"
+        text = f"found '{use.type}', expected a message of '{of}'"
+        hint = workspaces.elsewhere(of, name) or did_you_mean(name, messages)
     else:
         return None
     return problem_at(file, text, use.line, use.column, hint)
+
+
+def undeclared(packages: Sequence[Package]) -> list[Problem]:
+    """Packages that message files use and manifests do not name: colcon may not find them."""
+    return [
+        problem_at(
+            package.folder / MANIFEST,
+            f"no <depend>{name}</depend>, and message files use '{name}'",
+            hint="colcon builds the package only if another dependency brings it",
+        )
+        for package in packages
+        for name in sorted(package.used - package.declared)
+    ]
 
 
 @dataclass(frozen=True)
@@ -153,11 +164,6 @@ def read_definition(package: str, file: Path) -> Definition:
         found.problems.append(problem_at(file, f"cannot be read: {error}"))
         return found
     lines = text.splitlines()
-    for number, line in enumerate(lines, 1):
-        # rosidl writes Latin-1, and reads it as UTF-8.
-        if odd := next((each for each in line if not each.isascii()), ""):
-            text = f"found '{odd}', expected ASCII, in comments, too"
-            found.problems.append(problem_at(file, text, number, line.index(odd) + 1))
     separators = [number for number, line in enumerate(lines, 1) if line == _SEPARATOR]
     needed = _PARTS[file.suffix] - 1
     if len(separators) != needed:
@@ -227,7 +233,12 @@ def _parsed(package: str, code: str) -> Field | Constant:
     try:
         if is_constant:
             return Constant(type_text, name, value)
+        if type_.is_array and (odd := next((each for each in value if not each.isascii()), "")):
+            text = "ASCII, which is all that rosidl can write there"
+            raise _Wrong(f"'{odd}' in the default of an array", text, code.index(odd) + 1)
         return Field(type_, name, value.lstrip() or None)
+    except _Wrong:
+        raise
     except NameError:
         rule = _A_CONSTANT if is_constant else _A_FIELD
         raise _Wrong(f"the name '{name}'", rule, column) from None

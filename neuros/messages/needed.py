@@ -96,9 +96,13 @@ class Messages:
         """Whether everything is built."""
         return all(built.is_there for built in self.built)
 
+    @property
+    def _missing(self) -> list[Package]:
+        return [build.package for build in self._builds if not build.built.is_there]
+
     def problems(self) -> list[Problem]:
         """Mistakes in the files of packages; a built package had none."""
-        missing = [build.package for build in self._builds if not build.built.is_there]
+        missing = self._missing
         if not missing:
             return self._problems
         # Imported here: most of the time everything is built.
@@ -106,10 +110,18 @@ class Messages:
 
         return [*self._problems, *check(missing, self._workspaces)]
 
-    def note_use(self) -> None:
+    def doubts(self) -> list[Problem]:
+        """What ROS may refuse in packages that are not built yet."""
+        if not (missing := self._missing):
+            return []
+        from neuros.messages.checking import undeclared
+
+        return undeclared(missing)
+
+    def record_use(self) -> None:
         """Keep the builds from being removed as unused."""
         for built in self.built:
-            built.note_use()
+            built.record_use()
 
     def make(self, progress: Progress, environment: Mapping[str, str]) -> None:
         """Build what is missing.
@@ -244,13 +256,8 @@ class _Builder:
         """
         built = self.build.built
         try:
-            with built.locked(wait=False) as is_mine:
-                if is_mine:
-                    self._make()
-                    return
-            self.progress.step(f"waiting for another program that builds {self._name}")
-            with built.locked():
-                self._make()
+            text = f"waiting for another program that builds {self._name}"
+            built.build(self._make, lambda: self.progress.step(text))
         except OSError as error:
             raise EnvironmentFault(
                 f"message package '{self._name}' cannot be built in {built.folder.parent}"
@@ -299,7 +306,9 @@ class _Builder:
             shares,
         )
         # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.
-        self._run([sys.executable, "-I", generation.__file__], order.text())
+        # Generators open some files in the encoding of the locale, which may not be UTF-8.
+        command = [sys.executable, "-I", "-X", "utf8", generation.__file__]
+        self._run(command, order.text())
 
     def _compile(self) -> None:
         """Make the libraries of the package, and its module for Python."""
@@ -407,7 +416,7 @@ class _Builder:
             env=self.environment,
             input=given,
             capture_output=True,
-            text=True,
+            encoding="utf-8",
             errors="replace",
             check=False,
         )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import sys
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +19,10 @@ KINDS = ("msg", "srv", "action")
 _LONGEST_NAME = 200
 """Names of files have at most 255 bytes: the name of a package, and up to 50 more."""
 
+_USED = re.compile(rb"^([a-z][a-z0-9_]*)/[A-Z]\w*[\[ \t]", re.MULTILINE)
+_BUILDS_INTERFACES = ("rosidl_interface_packages", "rosidl_default_generators")
+"""Names in the manifest of a package whose interfaces ROS builds."""
+
 _IGNORED = ("COLCON_IGNORE", "AMENT_IGNORE", "CATKIN_IGNORE")
 _NOT_SOURCES = {"build", "install", "log"}
 
@@ -28,13 +34,20 @@ class Package:
     Attributes:
         folder: holds ``package.xml``.
         files: its interface files, relative to the folder: ``msg/Joints.msg``.
-        dependencies: packages that the manifest names for building or running.
+        declared: packages that the manifest names for building or running.
+        used: packages whose messages its files use.
     """
 
     name: str
     folder: Path
     files: tuple[Path, ...]
-    dependencies: frozenset[str]
+    declared: frozenset[str]
+    used: frozenset[str]
+
+    @property
+    def dependencies(self) -> frozenset[str]:
+        """Packages that are built before it; ROS finds the used ones through the declared ones."""
+        return self.declared | self.used
 
     @property
     def messages(self) -> set[str]:
@@ -72,12 +85,15 @@ def find_packages(workspace: Path) -> tuple[list[Package], list[Problem]]:
             for kind in KINDS
             for file in sorted((folder / kind).glob(f"*.{kind}"))
         )
-        if not files:
+        others = [] if files else misplaced(folder)
+        if not (files or others):
             continue
         try:
-            package = _read(folder, files)
+            package = _read(folder, files, others)
         except ManifestError as error:
             problems.append(error.problem)
+            continue
+        if package is None:
             continue
         twin = next((other for other in packages if other.name == package.name), None)
         if twin:
@@ -86,6 +102,27 @@ def find_packages(workspace: Path) -> tuple[list[Package], list[Problem]]:
         else:
             packages.append(package)
     return packages, problems
+
+
+def misplaced(folder: Path) -> list[Path]:
+    """Interface files of a package that are in none of the folders of interfaces."""
+    found = []
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(f for f in folders if f[0] != "." and f not in _NOT_SOURCES)
+        for name in sorted(names):
+            file = Path(place, name).relative_to(folder)
+            if file.suffix[1:] in KINDS and file.parent.as_posix() != file.suffix[1:]:
+                found.append(file)
+    return found
+
+
+def wrong_place(file: Path) -> str:
+    """The problem of an interface file that is in another folder than those of interfaces."""
+    kind, place = (
+        file.suffix[1:],
+        "" if file.parent == Path() else f" in the folder '{file.parent}'",
+    )
+    return f"found {file.name}{place}, expected it in the folder '{kind}' beside {MANIFEST}"
 
 
 def problem_at(file: Path, text: str, line: int = 1, column: int = 1, hint: str = "") -> Problem:
@@ -105,7 +142,12 @@ class ManifestError(Exception):
         super().__init__(str(problem))
 
 
-def _read(folder: Path, files: tuple[Path, ...]) -> Package:
+def _read(folder: Path, files: tuple[Path, ...], others: Sequence[Path]) -> Package | None:
+    """Read the manifest; ``None`` for a package without interfaces for ROS to build.
+
+    Args:
+        others: its interface files in other folders, if it has none in the right ones.
+    """
     # Imported here: it takes 50 ms, and most projects have no message packages.
     from catkin_pkg.package import InvalidPackage, parse_package_string
 
@@ -125,8 +167,24 @@ def _read(folder: Path, files: tuple[Path, ...]) -> Package:
     if len(manifest.name) > _LONGEST_NAME:
         text = f"the name of the package has {len(manifest.name)} characters, at most"
         raise ManifestError(problem_at(file, f"{text} {_LONGEST_NAME} are allowed"))
+    if others:
+        tools = (*manifest.buildtool_depends, *manifest.build_depends, *manifest.member_of_groups)
+        if all(each.name not in _BUILDS_INTERFACES for each in tools):
+            return None
+        more = f" (and {len(others) - 1} more)" if len(others) > 1 else ""
+        raise ManifestError(problem_at(folder / others[0], f"{wrong_place(others[0])}{more}"))
     depends = (*manifest.build_depends, *manifest.build_export_depends, *manifest.exec_depends)
-    return Package(manifest.name, folder, files, frozenset(each.name for each in depends))
+    declared = frozenset(each.name for each in depends)
+    return Package(manifest.name, folder, files, declared, _used(folder, files) - {manifest.name})
+
+
+def _used(folder: Path, files: Sequence[Path]) -> frozenset[str]:
+    """The packages that interface files name, as in ``std_msgs/Header header``."""
+    used: set[str] = set()
+    for file in files:
+        with contextlib.suppress(OSError):  # the check of message packages reports it
+            used |= {name.decode() for name in _USED.findall((folder / file).read_bytes())}
+    return frozenset(used)
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,15 @@ from pathlib import Path
 
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.errors import Problem
-from neuros.messages.package import MANIFEST, Package, Ros, find_packages, problem_at
+from neuros.messages.package import (
+    MANIFEST,
+    Package,
+    Ros,
+    find_packages,
+    misplaced,
+    problem_at,
+    wrong_place,
+)
 from neuros.project.message_types import MessageField
 
 _FORMAT = b"1"  # of built packages; a change builds all packages again
@@ -102,6 +110,13 @@ class Workspaces:
     def messages(self, package: str) -> Collection[str] | None:
         """The names of the messages of a package, ``None`` if it is not in a workspace."""
         return self.packages[package].messages if package in self.packages else None
+
+    def elsewhere(self, package: str, name: str) -> str:
+        """Where a package of a workspace has a message of this name, if in a wrong folder."""
+        if package not in self.packages:
+            return ""
+        others = (f for f in misplaced(self.packages[package].folder) if f.name == f"{name}.msg")
+        return next(map(wrong_place, others), "")
 
     def installed(self, package: str) -> Path | None:
         """The folder of the build of a package, ``None`` if it is not in a workspace."""
@@ -229,7 +244,7 @@ class Built(Kept):
     def is_there(self) -> bool:
         return self.folder.is_dir()
 
-    def note_use(self) -> None:
+    def record_use(self) -> None:
         """Keep the build from being removed as unused."""
         with contextlib.suppress(OSError):
             os.utime(self.folder)

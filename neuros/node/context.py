@@ -80,11 +80,14 @@ class ContextSwitch:
     """Puts the context of one node at a time in place.
 
     On ``sys.meta_path`` it refuses to import a library that another node has for itself.
+
+    Attributes:
+        current: the context that is in place.
     """
 
     def __init__(self) -> None:
         self._process = Context({}, os.environ._data, sys.path)  # type: ignore[attr-defined]
-        self._current = self._process
+        self.current = self._process
         self._known_modules = len(sys.modules)
         # A library that the program has imported itself belongs to none of the nodes yet.
         self._process.modules |= {n: sys.modules[n] for n in _FOR_ONE_NODE if n in sys.modules}
@@ -130,7 +133,7 @@ class ContextSwitch:
 
     def enter(self, context: Context) -> None:
         """Put ``context`` in place."""
-        current = self._current
+        current = self.current
         if current is context:
             return
         modules = sys.modules
@@ -138,8 +141,16 @@ class ContextSwitch:
             self._find_modules(current)
         for name in current.modules:
             modules.pop(name, None)
-        self._current = context
-        self._set_variables(current, context)
+        self.current = context
+        keys = self._differing.get((current, context))
+        if keys is None:
+            keys = self._differing[current, context] = _differing(current, context)
+        for key in keys:  # C libraries see them, too (getenv)
+            value = context.environ.get(key)
+            if value is None:
+                os.unsetenv(key)
+            else:
+                os.putenv(key, value)
         # Within os.environ itself, so that other references to it show these, too.
         own, os.environ._data = os.environ._data, context.environ  # type: ignore[attr-defined]
         current.environ, current.path, sys.path = own, sys.path, context.path
@@ -148,10 +159,6 @@ class ContextSwitch:
         if context.log_fd is not None:
             os.dup2(context.log_fd, 1)
             os.dup2(context.log_fd, 2)
-
-    def has(self, context: Context) -> bool:
-        """Whether ``context`` is in place."""
-        return self._current is context
 
     def leave(self) -> None:
         """Give the process its own context back (but for its output, if a node has a log)."""
@@ -203,9 +210,9 @@ class ContextSwitch:
 
     def find_spec(self, name: str, *_: object) -> ModuleSpec | None:
         """Part of the import system: refuse a library that another node has for itself."""
-        if name not in _FOR_ONE_NODE or self._current is self._process:
+        if name not in _FOR_ONE_NODE or self.current is self._process:
             return None
-        if self._owners.setdefault(name, self._current) is not self._current:
+        if self._owners.setdefault(name, self.current) is not self.current:
             raise ImportError(
                 f"{_FOR_ONE_NODE[name]}, and another node of this process uses it: run the project"
                 " with --backend process"
@@ -222,18 +229,11 @@ class ContextSwitch:
             if name in sys.modules and context is owner:
                 context.modules[name] = self._process.modules[name] = sys.modules[name]
 
-    def _set_variables(self, old: Context, new: Context) -> None:
-        """Let C libraries see the variables that differ (``getenv``)."""
-        keys = self._differing.get((old, new))
-        if keys is None:
-            keys = self._differing[old, new] = [
-                os.environ.encodekey(name)
-                for name in {**old.variables, **new.variables}
-                if old.variables.get(name) != new.variables.get(name)
-            ]
-        for key in keys:
-            value = new.environ.get(key)
-            if value is None:
-                os.unsetenv(key)
-            else:
-                os.putenv(key, value)
+
+def _differing(old: Context, new: Context) -> list[Any]:
+    """The names of the variables that differ, encoded as ``os.environ`` keeps them."""
+    return [
+        os.environ.encodekey(name)
+        for name in {**old.variables, **new.variables}
+        if old.variables.get(name) != new.variables.get(name)
+    ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from types import CodeType
@@ -69,7 +70,14 @@ def as_node_error(error: BaseException, what: str = "") -> NodeError:
 def callback_error(error: BaseException, callback: Any = None) -> NodeError:
     """The error of a callback; without ``callback``, it is looked for in the traceback."""
     wrapped: NodeError
-    code = _code_of(callback) or _outermost_code(error)
+    code = _code_of(callback)
+    if code is None:  # of the first frame in the traceback that is of the project
+        codes = (
+            frame.f_code
+            for frame, _ in traceback.walk_tb(error.__traceback__)
+            if not _is_library(frame.f_code, frame.f_globals.get("__name__", ""))
+        )
+        code = next(codes, None)
     if code is None:
         wrapped = NodeError(f"failed outside its hooks: {describe(error)}")
     else:
@@ -89,17 +97,6 @@ def _code_of(callback: Any) -> CodeType | None:
     if not isinstance(code, CodeType):
         return None
     return None if _is_library(code, getattr(function, "__module__", "")) else code
-
-
-def _outermost_code(error: BaseException) -> CodeType | None:
-    """Of the first frame in the traceback that is of the project."""
-    trace = error.__traceback__
-    while trace is not None:
-        code = trace.tb_frame.f_code
-        if not _is_library(code, trace.tb_frame.f_globals.get("__name__", "")):
-            return code
-        trace = trace.tb_next
-    return None
 
 
 def _is_library(code: CodeType, module: object) -> bool:

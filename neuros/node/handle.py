@@ -44,7 +44,7 @@ class PluginServices:
         is_ending: whether no further hook starts.
         results: what the plugin has noted.
             keeping: what it keeps.
-        make_packet: a new packet, for the type of a port.
+        maker_of: the function that makes packets of the type of a port.
             time: that of the node, if it has one.
         virtual_time: that of the run; ``None``: the run is in real time.
         waiting_threads: those that wait until packets that they have offered are sent.
@@ -69,7 +69,7 @@ class PluginServices:
         self.is_active = threading.Event()
         self.virtual_time: VirtualTime | None = None
         self.waiting_threads: set[threading.Thread] = set()
-        self.make_packet = packets.make
+        self.maker_of = packets.maker
         self._loop = loop
         self.time = time
         self._failures = failures
@@ -115,7 +115,7 @@ class PluginServices:
         """Simulated time has gone on in another thread; returns whether it is not over."""
         is_over = self.time.is_over
         if is_over:
-            self._loop.post_from_thread(lambda: self._failures.guard(self.time.look))
+            self._loop.post_from_thread(lambda: self._failures.guard(self.time.update))
         return not is_over
 
     def fail_from_thread(self, error: BaseException) -> None:
@@ -138,7 +138,7 @@ class PluginServices:
             self.waiting_threads.add(thread)
             withdrawals.append(self.engine.offer(packets, accept))
             if self.time.is_watched:
-                self.time.look()
+                self.time.update()
 
         def withdraw(done: Callable[[], None]) -> None:
             def event() -> None:
@@ -161,6 +161,7 @@ class NodeHandle:
         self._ros_node = ros_node
         self._services = services
         self._types = {port.name: port.type for port in file.node.outputs}
+        self._makers: dict[str, Callable[[], Any]] = {}
         self._user_data: Any = None
 
     @property
@@ -223,15 +224,16 @@ class NodeHandle:
             NodeError: if the node has no such output, or several could be meant.
         """
         if output is None:
-            return self._services.make_packet(self._only_type())
-        try:
-            type_name = self._types[output]
-        except KeyError:
-            known = ", ".join(self._types) or "none"
-            raise NodeError(
-                f"make_packet: node '{self.name}' has no output '{output}' (it has {known})"
-            ) from None
-        return self._services.make_packet(type_name)
+            return self._services.maker_of(self._only_type())()
+        make = self._makers.get(output)
+        if make is None:
+            if output not in self._types:
+                known = ", ".join(self._types) or "none"
+                raise NodeError(
+                    f"make_packet: node '{self.name}' has no output '{output}' (it has {known})"
+                )
+            make = self._makers[output] = self._services.maker_of(self._types[output])
+        return make()
 
     def get_ros_node(self) -> Any:
         """The real ``rclpy.node.Node``; what is created on it is served between hooks."""

@@ -1,8 +1,8 @@
-"""Instruments of a node: what looks at its packets as they pass, bound only where it is used.
+"""Instruments of a node see its packets as they pass, and are bound only where they are used.
 
-A :class:`Tap` is one place where packets pass: an output, an input, a connection. The clock, the
-sampler and the packet recorder are told of each tap once, when it is made, and attach themselves
-where they want something.
+A :class:`Passage` is a place where packets pass: an output, an input or a connection. Each
+instrument (the clock, the sampler, the packet recorder) gets each passage once, when that is made,
+and adds an observer where it needs the packets.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from neuros.ports import Logger, PacketRecorder, Way
 from neuros.project.model import Connection, Port
 
 Observe: TypeAlias = Callable[[Any, "bytes | None"], object]
-"""Looks at a packet, which is given serialised, too, where that was made anyway."""
+"""Observes a packet; gets its serialisation, too, where that exists anyway."""
 
 
-class Tap:
+class Passage:
     """A place where packets pass a node.
 
     Attributes:
@@ -48,8 +48,8 @@ class Tap:
 class Instrument(Protocol):
     """Watches packets of a node."""
 
-    def attach(self, tap: Tap) -> None:
-        """Add what looks at the packets of a tap, at once or for as long as it is asked for."""
+    def attach(self, passage: Passage) -> None:
+        """Add observers to a passage, at once or while they are asked for."""
 
 
 _MOST_PACKETS = 1000
@@ -114,12 +114,12 @@ class PacketHistories:
         self._copy_of = copy_of
         self.by_output: dict[str, PacketHistory] = {}
 
-    def attach(self, tap: Tap) -> None:
+    def attach(self, passage: Passage) -> None:
         """Keep what passes there, if it is an output."""
-        if tap.way is not Way.SENT:
+        if passage.way is not Way.SENT:
             return
-        encode, copy = self._encode, self._copy_of and self._copy_of(tap.port)
-        by_output, name = self.by_output, tap.name
+        encode, copy = self._encode, self._copy_of and self._copy_of(passage.port)
+        by_output, name = self.by_output, passage.name
 
         def keep(packet: Any, data: bytes | None) -> None:
             content = copy(packet) if copy else data or encode(packet)
@@ -130,7 +130,7 @@ class PacketHistories:
             history.count += 1
             history.packets.append(content)
 
-        tap.add(keep)
+        passage.add(keep)
 
 
 class NodeRecorder:
@@ -157,14 +157,14 @@ class NodeRecorder:
         self._logger = logger
         self.failure: str | None = None
 
-    def attach(self, tap: Tap) -> None:
+    def attach(self, passage: Passage) -> None:
         """Keep the packets there, if they are recorded."""
         if self._recorder is None:
             return
-        stream = self._recorder.stream(tap.way, tap.name)
+        stream = self._recorder.stream(passage.way, passage.name)
         if stream is not None:
             number = stream
-            tap.add(lambda packet, data: self.keep(number, packet, data))
+            passage.add(lambda packet, data: self.keep(number, packet, data))
 
     def keep(self, stream: int, packet: Any, data: bytes | None) -> None:
         """Record a packet; ``data`` is the packet, if serialised already."""

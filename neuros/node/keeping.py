@@ -106,7 +106,7 @@ class Keeping:
             raise NodeError(f"keep: '{name}' cannot be written ({error.strerror})") from error
 
     def begin_anew(self, names: Collection[str], *, forgets: bool) -> None:
-        """Take these values over into the next life, and save them; those of before are removed.
+        """Save these values for the node after its reset; older files are removed.
 
         Args:
             forgets: whether the plugin is loaded anew, and registers them again.
@@ -126,7 +126,7 @@ class Keeping:
             self._functions.clear()
         self._earlier = {*self._functions}
 
-    def settle(self) -> None:
+    def restore_waiting(self) -> None:
         """All initialise hooks have run: put what waits, by functions of an earlier life.
 
         Raises:
@@ -180,7 +180,7 @@ def _data_of(name: str, value: Any) -> bytes:
 
 
 def no_such(node: str, name: str, known: Iterable[str]) -> NodeError:
-    """What to say where a node does not keep what is to be restored."""
+    """The error for a value that is to be restored and that no node keeps."""
     names = [*known]
     has = did_you_mean(name, names) or (f"it keeps {listed(names)}" if names else "")
     has = has or "call node.keep in an initialise hook"
@@ -225,7 +225,7 @@ def decoded(data: bytes) -> Any:
 
 
 def _taken_apart(value: Any, path: tuple[str, ...], arrays: dict[str, NDArray[Any]]) -> Any:
-    """What JSON tells of a value; its arrays are added to ``arrays``."""
+    """A value as JSON; its arrays are added to ``arrays``."""
     import numpy as np
 
     if isinstance(value, np.generic) and not value.dtype.hasobject:

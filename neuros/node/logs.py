@@ -134,18 +134,38 @@ class PacketLog:
     def write(self) -> None:
         """Write what has come since the last time. Any thread, but the node's own hooks go on."""
         with self._lock:
-            for name, entries in self._all():
-                # Each is one step for the interpreter: what is appended meanwhile stays for later.
-                count = len(entries)
-                data = entries[:count].tobytes()
-                del entries[:count]
-                is_kept = self._list_bytes or name == EVENT_LOG
-                if data and name and is_kept and self.failure is None:
-                    self._append(name, data)
-            hooks = self._engine.execution_log.hooks[:] if self._list_bytes else []
-            if len(hooks) > self._hooks_written and self.failure is None:
-                self._hooks_written = len(hooks)
-                self._write_hooks(hooks)
+            try:
+                self._write()
+            except OSError as error:  # what is left waits in memory until the next time
+                self.failure = (
+                    f"{self._folder} could not be written to ({error.strerror}): latencies and"
+                    " digests end there"
+                )
+
+    def _write(self) -> None:
+        for name, entries in self._all():
+            # Each is one step for the interpreter: what is appended meanwhile stays for later.
+            count = len(entries)
+            data = entries[:count].tobytes()
+            del entries[:count]
+            is_kept = self._list_bytes or name == EVENT_LOG
+            if not (data and name and is_kept) or self.failure is not None:
+                continue
+            if name not in self._lists:
+                is_of_packets = "." in name
+                self._lists[name] = _List(
+                    self._folder / name,
+                    self._list_bytes if is_of_packets else MOST_BYTES,
+                    keeps_first=not is_of_packets or isinstance(self._engine, LoggedEngine),
+                )
+            self._folder.mkdir(parents=True, exist_ok=True)
+            self._lists[name].append(data)
+        hooks = self._engine.execution_log.hooks[:] if self._list_bytes else []
+        if len(hooks) > self._hooks_written and self.failure is None:
+            self._hooks_written = len(hooks)
+            text = json.dumps([{"name": name, "kind": kind} for name, kind in hooks])
+            self._folder.mkdir(parents=True, exist_ok=True)
+            (self._folder / "hooks.json").write_text(text, "utf-8")
 
     def _all(self) -> Iterator[tuple[str, array[Any]]]:
         for connection, window in self._engine.send_windows.items():
@@ -162,34 +182,6 @@ class PacketLog:
             yield EVENT_LOG, self._engine.event_log
         for connection, digests in self._digests.items():
             yield f"{connection.index}.digests", digests
-
-    def _append(self, name: str, data: bytes) -> None:
-        if name not in self._lists:
-            is_of_packets = "." in name
-            self._lists[name] = _List(
-                self._folder / name,
-                self._list_bytes if is_of_packets else MOST_BYTES,
-                keeps_first=not is_of_packets or isinstance(self._engine, LoggedEngine),
-            )
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            self._lists[name].append(data)
-        except OSError as error:
-            self._fail(error)
-
-    def _write_hooks(self, hooks: list[tuple[str, str]]) -> None:
-        text = json.dumps([{"name": name, "kind": kind} for name, kind in hooks])
-        try:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            (self._folder / "hooks.json").write_text(text, "utf-8")
-        except OSError as error:
-            self._fail(error)
-
-    def _fail(self, error: OSError) -> None:
-        self.failure = (
-            f"{self._folder} could not be written to ({error.strerror}): latencies and digests"
-            " end there"
-        )
 
 
 WORLD_LOG = "world.jsonl"

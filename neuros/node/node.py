@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+from neuros.arithmetic import note_arithmetic
 from neuros.control import AtRest, Finalising, Message, Progress, Ready, Shutdown
 from neuros.control.link import to_bytes
 from neuros.engine.engine import Engine
@@ -19,10 +20,10 @@ from neuros.engine.node_ports import PacketType
 from neuros.engine.sim_clock import with_clocks
 from neuros.errors import ControlError, HookError, NeurosError, NodeError, ProtocolError
 from neuros.hooks import HookKind, HookSpec, hook_specs_of
-from neuros.node.context import ContextSwitch
+from neuros.node.context import Context, ContextSwitch
 from neuros.node.failures import Failures, as_node_error
 from neuros.node.handle import NodeHandle, PluginServices, Results
-from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Tap
+from neuros.node.instruments import Instrument, NodeRecorder, PacketHistories, Passage
 from neuros.node.keeping import Keeping
 from neuros.node.logs import WorldLog
 from neuros.node.plugin import describe, last_line, load_plugin
@@ -168,23 +169,24 @@ class NodeRuntime:
             self.failures,
             self._time,
             instruments,
-            enter=self._enter,
-            on_ready=self._note_ready,
-            on_initialised=self._note_initialised,
+            contexts=contexts,
+            context=self._context,
+            on_ready=self._on_ready,
+            on_initialised=self._on_hook_initialised,
         )
         world_log = None if recorder is None else WorldLog(self.run_dir, self._logger)
         self.reports = NodeReports(
             *(file, middleware, self._transport, self._time, sampler, clock),
             *(self._recorder, world_log, lambda: self.keeping.names),
         )
-        node, tap = file.node, self._effects.tap
+        node, passage = file.node, self._effects.passage
         arrivals = {
-            c: tap(Way.RECEIVED, node.input(c.destination_input), c)
+            c: passage(Way.RECEIVED, node.input(c.destination_input), c)
             for c in file.connections
             if c.destination_node == self.name != c.source_node
         }
         self._arrivals = {c: each for c, each in arrivals.items() if each.observers}
-        self._heard = {p.name: tap(Way.HEARD, p) for p in node.inputs if p.external_topic}
+        self._heard = {p.name: passage(Way.HEARD, p) for p in node.inputs if p.external_topic}
 
     @property
     def run_dir(self) -> Path:
@@ -194,7 +196,7 @@ class NodeRuntime:
     @property
     def has_context(self) -> bool:
         """Whether the context of this node is in place now."""
-        return self._contexts.has(self._context)
+        return self._contexts.current is self._context
 
     @property
     def sim_time(self) -> float | None:
@@ -241,6 +243,12 @@ class NodeRuntime:
 
     def activate(self) -> None:
         """Every node of the project is ready: tick and function hooks may start from now on."""
+        if self._virtual is None:
+            self._activate()
+        else:
+            self._virtual.at_zero(self._activate, self.on_timer)
+
+    def _activate(self) -> None:
         if self._services.virtual_time is not None:
             self._services.virtual_time.activate()
         self._guard(self._loaded.activate)
@@ -333,16 +341,18 @@ class NodeRuntime:
             known = isinstance(error, NeurosError)
             self.failures.report(error if known else as_node_error(error, "a fork changes it: "))
 
-    def drain(self, last_round: Sequence[int] = ()) -> None:
+    def drain(self, last_round: Sequence[int] = (), *, is_asked: bool = False) -> None:
         """Stop the hooks that send unasked; after a pause, the others go on.
 
-        Those of ``last_round`` (see :meth:`Engine.drain`) start at most once more.
+        Args:
+            last_round: hooks that start at most once more; see :meth:`Engine.drain`.
+            is_asked: whether a node has asked for this, at a time of the run's clock.
         """
         drain = partial(self._guard, lambda: self._loaded.drain(last_round))
         if self._virtual is None:
             drain()
         else:
-            self._virtual.drain(drain, self.stop)
+            self._virtual.drain(drain, self.stop, is_asked=is_asked)
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`."""
@@ -353,8 +363,13 @@ class NodeRuntime:
         self._guard(self._loaded.resume)
 
     def step(self, count: int, *, is_driven: bool) -> None:
-        """While paused, let the hooks that drive the project start so many times more."""
-        self._guard(lambda: self._loaded.step(count, is_driven=is_driven))
+        """While paused, let each hook that drives the project start ``count`` times."""
+        engine = self.engine
+        assert engine is not None
+        try:
+            engine.step(count, is_driven=is_driven)
+        except NeurosError as error:
+            self.failures.report(error)
 
     def stop(self) -> None:
         """Start no further hook. Any thread."""
@@ -373,6 +388,7 @@ class NodeRuntime:
             self._save_packets()
         if self._recorder is not None:
             self._recorder.close()
+        note_arithmetic(self.run_dir)
         self._services.close()
         self._tell(Finalising(self.name, None))
 
@@ -380,8 +396,8 @@ class NodeRuntime:
 
     def on_packet(self, connection: Connection, packet: Any) -> None:
         """A packet has arrived on a connection."""
-        if self._arrivals and (tap := self._arrivals.get(connection)) is not None:
-            for observe in tap.observers:
+        if self._arrivals and (passage := self._arrivals.get(connection)) is not None:
+            for observe in passage.observers:
                 observe(packet, None)
         engine = self.engine
         assert engine is not None
@@ -394,7 +410,7 @@ class NodeRuntime:
         """A packet has arrived on an external topic."""
         for observe in self._heard[port.name].observers:
             observe(packet, None)
-        self._guard(lambda: self._loaded.on_packet(port.name, packet))
+        self._guard(partial(self._loaded.on_packet, port.name, packet))
 
     def deliver(self, input_name: str, data: bytes) -> None:
         """An observer sends a packet to an input of the session.
@@ -457,7 +473,19 @@ class NodeRuntime:
     def _make(self) -> Engine:
         """The engine for the hooks of now."""
         node = self.file.node
-        types = {port.name: self._packet_type(port) for port in node.outputs}
+        packets = self._middleware.packets
+        jpegs = {
+            c.source_output
+            for c in self.file.connections
+            if c.is_jpeg and c.source_node == self.name
+        }
+        types = {
+            port.name: PacketType(
+                packets.packet_class(port.type),
+                packets.checker(port.type, for_jpeg=port.name in jpegs),
+            )
+            for port in node.outputs
+        }
         self.engine = self._services.engine = self._make_engine(
             node, self.file.connections, self.specs, self._effects, self._clock, types
         )
@@ -467,19 +495,21 @@ class NodeRuntime:
         self._uninitialised = sum(spec.kind is HookKind.INITIALISE for spec in self.specs)
         return self.engine
 
-    def _note_ready(self) -> None:
-        self._settle()
+    def _on_ready(self) -> None:
+        self._restore()
+        if self._virtual is not None:
+            self._virtual.ready()
         self._tell(Ready(self.name))
 
-    def _note_initialised(self) -> None:
+    def _on_hook_initialised(self) -> None:
         self._uninitialised -= 1
-        self._settle()
+        self._restore()
         self._on_initialised()
 
-    def _settle(self) -> None:
+    def _restore(self) -> None:
         """Put what waits into values that were kept, once all initialise hooks have run."""
         if not self._uninitialised:
-            self.keeping.settle()
+            self.keeping.restore_waiting()
 
     def _save_packets(self) -> None:
         """Leave the newest packets for a session, which may want to see what led to the end."""
@@ -499,13 +529,6 @@ class NodeRuntime:
     @property
     def _resets(self) -> list[HookSpec]:
         return [spec for spec in self._plugin if spec.kind is HookKind.RESET]
-
-    def _packet_type(self, port: Port) -> PacketType:
-        packets = self._middleware.packets
-        own = [c for c in self.file.connections if c.source_node == self.file.node.name]
-        for_jpeg = any(c.is_jpeg for c in own if c.source_output == port.name)
-        check = packets.checker(port.type, for_jpeg=for_jpeg)
-        return PacketType(packets.packet_class(port.type), check)
 
     @property
     def _loaded(self) -> Engine:
@@ -532,7 +555,7 @@ class NodeEffects:
     """The :class:`~neuros.engine.engine.Effects` of one running node.
 
     Args:
-        enter: puts the context of the node in place.
+        contexts, context: the context of the node, and what puts it in place.
         instruments: what looks at packets, in this order.
         on_ready: called once the node waits for all others to become ready.
         on_initialised: called after each initialise hook.
@@ -549,7 +572,8 @@ class NodeEffects:
         time: SimulatedTime,
         instruments: Sequence[Instrument],
         *,
-        enter: Callable[[], None],
+        contexts: ContextSwitch,
+        context: Context,
         on_ready: Callable[[], object],
         on_initialised: Callable[[], None],
     ) -> None:
@@ -565,18 +589,18 @@ class NodeEffects:
         self._note_execution = transport.note_execution
         self.give_way = transport.give_way
         self._instruments = instruments
-        self._sent: dict[str, Tap] = {}
-        self._taps_to_itself: dict[Connection, Tap] = {}
-        self._enter = enter
+        self._sent: dict[str, Passage] = {}
+        self._passages_to_itself: dict[Connection, Passage] = {}
+        self._contexts, self._context = contexts, context
         self.note_ready = on_ready
         self._on_initialised = on_initialised
 
-    def tap(self, way: Way, port: Port, connection: Connection | None = None) -> Tap:
-        """A place where packets pass, with the instruments that want to look at them."""
-        tap = Tap(way, port, connection)
+    def passage(self, way: Way, port: Port, connection: Connection | None = None) -> Passage:
+        """A place where packets pass, with the observers of all instruments."""
+        passage = Passage(way, port, connection)
         for instrument in self._instruments:
-            instrument.attach(tap)
-        return tap
+            instrument.attach(passage)
+        return passage
 
     def call(self, hook: Hook, arguments: Sequence[Any]) -> Any:
         """Run a hook in the context of its node.
@@ -584,7 +608,8 @@ class NodeEffects:
         Raises:
             HookError: if it raises any exception.
         """
-        self._enter()
+        if self._contexts.current is not self._context:
+            self._contexts.enter(self._context)
         spec = hook.spec
         try:
             result = spec.function(self._handle, *arguments)
@@ -596,7 +621,7 @@ class NodeEffects:
         if spec.kind is HookKind.INITIALISE:
             self._on_initialised()
         if self._time.is_watched:
-            self._time.look()
+            self._time.update()
         return result
 
     def finalise(self, spec: HookSpec) -> None:
@@ -615,16 +640,16 @@ class NodeEffects:
     def sender(self, port: Port, connections: Sequence[Connection]) -> Callable[[Any], None] | None:
         """Return what sends packets of an output, and shows them to the instruments."""
         transmit: Callable[[Any], bytes | None]
-        tap = self._sent.get(port.name)
-        if tap is None:  # else the node was reset
-            tap = self._sent[port.name] = self.tap(Way.SENT, port)
-        observed = tap
+        passage = self._sent.get(port.name)
+        if passage is None:  # else the node was reset
+            passage = self._sent[port.name] = self.passage(Way.SENT, port)
+        observed = passage
         if port.external_topic is not None:
             transmit = partial(self._transport.send_external, port)
         elif connections:
             transmit = self._transport.sender(connections)
-        elif tap.observers:
-            transmit = _to_nobody
+        elif passage.observers:
+            transmit = lambda _: None  # noqa: E731 - of an output that nothing is connected to
         else:
             return None
 
@@ -643,10 +668,11 @@ class NodeEffects:
 
     def copy_to_itself(self, connection: Connection, packet: Any) -> Any:
         port = self._handle.description.output(connection.source_output)
-        tap = self._taps_to_itself.get(connection)
-        if tap is None:
-            tap = self._taps_to_itself[connection] = self.tap(Way.TO_ITSELF, port, connection)
-        for observe in tap.observers:
+        passage = self._passages_to_itself.get(connection)
+        if passage is None:
+            passage = self.passage(Way.TO_ITSELF, port, connection)
+            self._passages_to_itself[connection] = passage
+        for observe in passage.observers:
             observe(packet, None)
         return self._copier(port.type)(packet)
 
@@ -680,10 +706,6 @@ class VirtualEffects(NodeEffects):
                 "the plugin has made a subscription, timer, service or client of ROS, which are"
                 " called in real time: use inputs and hooks, or run in real time"
             )
-
-
-def _to_nobody(packet: Any) -> None:
-    """Send a packet of an output that nothing is connected to."""
 
 
 def _hook_error(spec: HookSpec, error: BaseException) -> HookError:

@@ -36,28 +36,28 @@ class PeerLink:
         self._may_leave = threading.Event()
 
     def open(self, middleware: Middleware) -> None:
-        """Speak and listen from now on."""
+        """Publish and receive states from now on."""
         if not self._elsewhere:
             return
-        voice = middleware.join_peers(self._names, self._elsewhere, self._hear)
+        voice = middleware.join_peers(self._names, self._elsewhere, self._receive)
         with self._lock:
             self._voice = voice
             if self._last_state:
                 voice.say(self._last_state)
 
-    def say(self, text: str) -> None:
-        """Pass on what the launcher says, as soon as that is possible. Any thread."""
+    def publish(self, text: str) -> None:
+        """Publish a state of the launcher, as soon as that is possible. Any thread."""
         with self._lock:
             self._last_state = text
             if self._voice is not None:
                 self._voice.say(text)
 
     def leave(self) -> None:
-        """Nothing more will be said or needs to be heard. Any thread."""
+        """The launcher has published and received all states. Any thread."""
         self._may_leave.set()
 
     def close(self) -> None:
-        """Stay until the launcher has said and heard all; it is bound by what it waits for."""
+        """Wait until :meth:`leave`, but not for ever, and publish nothing more."""
         if self._voice is None:
             return
         self._may_leave.wait(_LEAVE_S)
@@ -65,5 +65,5 @@ class PeerLink:
             voice, self._voice = self._voice, None
         voice.close()
 
-    def _hear(self, name: str, text: str | None) -> None:
-        self._tell(control.Heard(name, text))
+    def _receive(self, name: str, text: str | None) -> None:
+        self._tell(control.StateOfPeer(name, text))

@@ -14,7 +14,6 @@ import sys
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeGuard
 
 from neuros.errors import NO_WAITING, NeurosError, NodeError, PluginError
 from neuros.hooks import HookSpec, hook_specs_of
@@ -65,7 +64,9 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
             raise PluginError(
                 f"{path}: there is no {error.name}: {_GONE_MODULES[error.name]}"
             ) from error
-        line = f":{error.lineno}" if _is_syntax_error_in(error, path) else ""
+        line = ""
+        if isinstance(error, SyntaxError) and error.filename == str(path):
+            line = f":{error.lineno}"
         raise PluginError(
             f"{path}{line}: cannot be imported: {describe(error)}\n{plugin_traceback(error, path)}"
         ) from error
@@ -81,15 +82,11 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
 
 
 def no_module(name: str) -> PluginError:
-    """What to say where a plugin is a module that this Python does not have."""
+    """The error for a plugin that is a module which this Python lacks."""
     return PluginError(
         f"there is no module {name} for {sys.executable}: its package goes into the"
         " requirements.txt of the node's container: docs/plugins.md"
     )
-
-
-def _is_syntax_error_in(error: BaseException, path: Path) -> TypeGuard[SyntaxError]:
-    return isinstance(error, SyntaxError) and error.filename == str(path)
 
 
 def describe(error: BaseException) -> str:
@@ -113,19 +110,16 @@ def _hint(error: BaseException) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     if any(frame.name == "get_global_executor" for frame in frames):  # by rclpy.spin and the like
         return NO_WAITING
-    if isinstance(error, FileNotFoundError) and _is_relative(error.filename):
+    file = error.filename if isinstance(error, FileNotFoundError) else None
+    if isinstance(file, str | bytes) and file and not os.path.isabs(file):
         if frames and frames[-1].filename.endswith("/subprocess.py"):
             return ""  # it is a program, and is looked for on the PATH
-        name, folder = os.fsdecode(error.filename), os.path.realpath("/proc/self/cwd")
+        name, folder = os.fsdecode(file), os.path.realpath("/proc/self/cwd")
         return (
             f"relative to the current folder, which is {folder}; a file beside the plugin, or of"
             f" the project, is node.resolve_path({name!r})"
         )
     return ""
-
-
-def _is_relative(name: object) -> TypeGuard[str | bytes]:
-    return isinstance(name, str | bytes) and bool(name) and not os.path.isabs(name)
 
 
 def last_line(error: BaseException, where: str) -> str:

@@ -13,7 +13,8 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from enum import IntEnum
 from typing import cast
 
 import neuros.control as control
@@ -38,6 +39,15 @@ Event = Callable[[], None]
 
 _REPORT_S = 1.0
 _DRAIN_S = 5.0
+
+
+class ProcessStage(IntEnum):
+    """How far a node process has come; it never goes back."""
+
+    LOADING = 0
+    INITIALISING = 1
+    ACTIVE = 2
+    ENDING = 3
 
 
 class NodeProcess:
@@ -83,18 +93,18 @@ class NodeProcess:
         self._is_held = is_held
         self._own_logs = own_logs
         self._contexts = ContextSwitch()
-        self._nodes: list[NodeRuntime] = []
-        self._by_name: dict[str, NodeRuntime] = {}
+        self._nodes: dict[str, NodeRuntime] = {}
         self._middleware: Middleware | None = None
         self._early_events: list[Event] = []
         self._early_lock = threading.Lock()
+        self._stage, self._stage_lock = ProcessStage.LOADING, threading.Lock()
+        self._has_begun = False  # whether hooks may have run; it stays while the process ends
         self._has_failed = False
+        self._goes_on = threading.Event()  # begins or ends
         self._asked: Advance | None = None
-        self._is_settling = False
-        self._has_begun = self._is_active = False
+        self._once_idle: list[Event] = []
         self._saving: tuple[str, Saving] | None = None  # of the node that finalises
         self._has_been_reset = False
-        self._stop_asked, self._may_begin = threading.Event(), threading.Event()
         self._tell_lock = threading.Lock()
         self._link: ControlLink | None = None
         self._peers = PeerLink(
@@ -117,7 +127,7 @@ class NodeProcess:
             thread.start()
             self._guard(self._live)
             self.report()  # hooks are over: what peers want to know is known before a long end
-            for node in self._nodes:
+            for node in self._nodes.values():
                 self._saving = node.name, Saving(node.run_dir)
                 self._guard(functools.partial(node.finalise, runs_hooks=self._has_begun))
                 self._guard(functools.partial(self._report_last, node))
@@ -129,74 +139,82 @@ class NodeProcess:
 
     # ------------------------------------------------------------------ called by the supervisor
 
-    def obey(self, message: Message) -> None:
+    def handle(self, message: Message) -> None:
         """Do what the supervisor asks for, between two events where hooks are concerned."""
         match message:
             case control.Begin():
                 self.post(self._begin)
-                self._may_begin.set()
-            case control.Activate():
-                self.post(self._activate)
+                self._goes_on.set()
             case control.Stop():
                 self.ask_to_stop()
             case control.StopHooks():
-                for node in tuple(self._nodes):
+                for node in tuple(self._nodes.values()):
                     node.stop()
             case control.Leave():
                 self._peers.leave()
-            case control.Say(text):
-                self._peers.say(text)
-            case control.Look(wanted, asker):
-                for node in tuple(self._nodes):
-                    self._tell(node.reports.look(wanted.get(node.name, {}), asker))
-            case control.Explain():
-                self._explain()
+            case control.PublishState(text):
+                self._peers.publish(text)
+            case control.GetStatus(wanted, asker):
+                for node in tuple(self._nodes.values()):
+                    self._tell(node.reports.status(wanted.get(node.name, {}), asker))
             case _:
-                self.post(lambda: self._obey_in_loop(message))
+                self.post(lambda: self._handle_in_loop(message))
 
-    def _obey_in_loop(self, message: Message) -> None:
+    def _handle_in_loop(self, message: Message) -> None:
         if self.is_ending:
             return
-        if isinstance(message, control.Probe):
-            self._probe(message.number)
-            return
-        if isinstance(message, Advance):
-            self._asked = message
-            self._begin_settling()
-            return
-        if isinstance(message, control.Reset):
-            self._reset(message)
-            return
-        if isinstance(message, control.Resume):
-            self._asked = None  # where the run goes freely, an answer would hold it again
-        for node in self._nodes:
-            match message:
-                case control.Drain(last_round):
-                    node.drain(last_round.get(node.name, ()))
-                case control.Pause():
+        nodes = self._nodes.values()
+        match message:
+            case control.Activate():
+                self._reach(ProcessStage.ACTIVE)
+                self._change(only_checks=True)
+                for node in nodes:
+                    node.activate()
+                for node in nodes:
+                    node.on_timer()
+            case control.Probe(number):
+                self._answer_probe(number)
+            case control.Advance():
+                self._asked = message
+                self._when_idle(self._answer_at_rest)
+            case control.Reset():
+                if why_not := self._why_not_reset():
+                    self._tell(control.WasReset(why_not))
+                    return
+                for node in nodes:
+                    node.pause()  # takes back what is left of steps, which might go on for ever
+                self._when_idle(lambda: self._reset(message))
+            case control.Drain(last_round, is_asked):
+                for node in nodes:
+                    node.drain(last_round.get(node.name, ()), is_asked=is_asked)
+            case control.Pause():
+                for node in nodes:
                     node.pause()
-                case control.Resume():
+            case control.Resume():
+                self._asked = None  # where the run goes freely, an answer would hold it again
+                for node in nodes:
                     node.resume()
-                case control.Step(count, is_driven):
+            case control.Step(count, is_driven):
+                for node in nodes:
                     node.step(count, is_driven=is_driven)
-                case control.Deliver(name, input_name, data) if name == node.name:
-                    node.deliver(input_name, data)
-                case control.Change(name) if name == node.name:
-                    node.change(
-                        message.variables, message.parameters, only_checks=message.only_checks
-                    )
+            case control.Deliver(name, input_name, data) if name in self._nodes:
+                self._nodes[name].deliver(input_name, data)
+            case control.Change(name) if name in self._nodes:
+                self._nodes[name].change(
+                    message.variables, message.parameters, only_checks=message.only_checks
+                )
 
     def ask_to_stop(self) -> None:
         """Start no further hook, then finalise and end. Any thread."""
-        self._stop_asked.set()
-        self._may_begin.set()
-        for node in tuple(self._nodes):
+        self._reach(ProcessStage.ENDING)
+        self._goes_on.set()
+        for node in tuple(self._nodes.values()):
             node.stop()
         if self._middleware is not None:
             self._middleware.loop.stop()
 
-    def let_go(self) -> None:
-        """The supervisor is gone: end, and wait for no peer. Any thread."""
+    def on_supervisor_gone(self) -> None:
+        """End, and wait for no peer. Any thread."""
         self.ask_to_stop()
         self._peers.leave()
 
@@ -210,7 +228,7 @@ class NodeProcess:
 
     def report(self) -> None:
         """Report state and counters of all nodes. Any thread."""
-        for node in tuple(self._nodes):
+        for node in tuple(self._nodes.values()):
             if not self.is_ending:  # else a log that grows would pass for progress of the plugin
                 node.reports.write_logs()
             self._tell(node.reports.report())
@@ -223,77 +241,74 @@ class NodeProcess:
         node.reports.write_logs()
         self._tell(node.reports.report(is_final=True))
 
-    def _probe(self, number: int) -> None:
+    def _answer_probe(self, number: int) -> None:
         """Report the state of all nodes at one moment."""
         assert self._middleware is not None
         is_idle = not self._middleware.loop.has_waiting_events
-        has_free_threads = self._has_free_threads()
-        for node in self._nodes:
+        # A thread besides those of NeuROS that does not wait for a connection may wake a node.
+        bound = {threading.main_thread(), threading.current_thread()}
+        bound.update(*(node.waiting_threads for node in self._nodes.values()))
+        has_free_threads = any(
+            thread not in bound and not isinstance(thread, ControlThread)
+            for thread in threading.enumerate()
+        )
+        for node in self._nodes.values():
             self._tell(
                 node.reports.probe(number, is_idle=is_idle, has_free_threads=has_free_threads)
             )
 
-    def _begin_settling(self) -> None:
-        if not self._is_settling:
-            self._is_settling = True
-            self._settle()
+    def _when_idle(self, action: Event) -> None:
+        """Do something once no event waits: a hook that may start has a loop-back waiting."""
+        self._once_idle.append(action)
+        if len(self._once_idle) == 1:
+            self._wait_until_idle()
 
-    def _settle(self) -> None:
-        """Answer once no event waits: a hook that may start has a loop-back waiting.
-
-        Of several questions the last one counts. Where the run is let go on, none is answered.
-        """
+    def _wait_until_idle(self) -> None:
         assert self._middleware is not None
         loop = self._middleware.loop
-        asked = self._asked
-        self._is_settling = asked is not None
-        if asked is None or self.is_ending:
-            return
         if loop.has_waiting_events or not loop.has_taken_in:
-            loop.post_loop_back(self._settle)
+            loop.post_loop_back(self._wait_until_idle)
             return
-        self._asked, self._is_settling = None, False
-        self._tell(_with_counters(_at_rest(self._nodes, asked), self._nodes))
+        actions, self._once_idle = self._once_idle, []
+        for action in actions:
+            action()
+
+    def _answer_at_rest(self) -> None:
+        """Answer the last ``advance``, unless the run was resumed meanwhile."""
+        asked, self._asked = self._asked, None
+        if asked is not None and not self.is_ending:
+            self._tell(_at_rest(self._nodes, asked))
 
     def _reset(self, asked: control.Reset) -> None:
-        """Bring all nodes back to their start, once no event waits, if they can be."""
+        """Bring all nodes back to their start, if they can still be."""
         assert self._middleware is not None
-        loop = self._middleware.loop
         if not (why_not := self._why_not_reset()):
-            for node in self._nodes:
-                node.pause()  # takes back what is left of steps, which might go on for ever
-            if loop.has_waiting_events or not loop.has_taken_in:
-                loop.post_loop_back(lambda: self._reset(asked))
-                return
             self._has_been_reset = True
             self._middleware.begin_anew(self._files, asked.variables)
-            for node in self._nodes:
+            for node in self._nodes.values():
                 try:
                     node.reset(asked.variables.get(node.name, {}), asked.keep.get(node.name, ()))
                 except NeurosError as error:
                     self._fail(node.name, error)
                     return
                 self._tell(declared(node.name, node.specs))
-                loop.post(functools.partial(node.start, awaits_others=not self._is_active))
+                start = functools.partial(
+                    node.start, awaits_others=self._stage < ProcessStage.ACTIVE
+                )
+                self._middleware.loop.post(start)
         self._tell(control.WasReset(why_not))
 
     def _why_not_reset(self) -> str:
         """Why the nodes cannot be reset where they are; empty if they can."""
-        if not all(node.is_paused for node in self._nodes):
+        nodes = self._nodes.values()
+        if not all(node.is_paused for node in nodes):
             return "the run is not paused: pause it first"
         connections = (c for file in self._files for c in file.connections)
-        if any({c.source_node, c.destination_node} - {*self._by_name} for c in connections):
+        if any({c.source_node, c.destination_node} - {*self._nodes} for c in connections):
             return "its nodes are in several processes"
         threads = {t for t in threading.enumerate() if not isinstance(t, ControlThread)}
         others = (f"a plugin has a thread ({t.name})" for t in threads - {threading.main_thread()})
-        return next(filter(None, (*(node.why_not_reset for node in self._nodes), *others)), "")
-
-    def _explain(self) -> None:
-        """Report why nothing moves; while a hook runs, that is what all nodes here wait for."""
-        nodes = tuple(self._nodes)
-        if not any(node.engine is not None and node.engine.executing for node in nodes):
-            for node in nodes:
-                self._tell(control.Explanation(node.name, tuple(node.reports.explain())))
+        return next(filter(None, (*(node.why_not_reset for node in nodes), *others)), "")
 
     # ------------------------------------------------------------------ inside
 
@@ -301,14 +316,23 @@ class NodeProcess:
         # Modules of ROS stay: rounds of the garbage collector would go through them for nothing.
         gc.disable()
         try:
-            middleware = self._open_middleware()
+            middleware = self._make_middleware(self._files, self._fail_outside_hooks)
+            if self._files[0].time == VIRTUAL:
+                loop = cast(VirtualRun, middleware.loop)
+                loop.plan(self._duration_s, self._end_by_duration, self._real_time_factor)
+                if self._fork is not None:
+                    loop.call_at(self._fork[0], functools.partial(self._change, only_checks=False))
+            with self._early_lock:
+                self._middleware = middleware
+                for event in self._early_events:
+                    middleware.loop.post_from_thread(event)
             self._peers.open(middleware)
             for file in self._files:
                 self._add(file)
         finally:
             gc.freeze()
             gc.enable()
-        for node in self._nodes:
+        for node in self._nodes.values():
             if self.is_ending:
                 return
             try:
@@ -317,47 +341,25 @@ class NodeProcess:
             except NeurosError as error:
                 self._fail(node.name, error)
         gc.freeze()
-        self._tell(control.Loaded())
-        self._may_begin.wait()  # meanwhile nothing of ROS is handled: nobody can send here
+        self._goes_on.wait()  # meanwhile nothing of ROS is handled: nobody can send here
         if not self.is_ending:
             self._guard(middleware.loop.run)
             middleware.take_in()
 
     def _begin(self) -> None:
         self._has_begun = True
-        for node in self._nodes:
+        self._reach(ProcessStage.INITIALISING)
+        for node in self._nodes.values():
             node.reports.begin()
         self.report()
-        for node in self._nodes:
+        for node in self._nodes.values():
             node.start(awaits_others=True)
 
     def _change(self, *, only_checks: bool) -> None:
         """Make the changes of a fork, or check them."""
-        assert self._fork is not None
-        for name, (variables, parameters) in self._fork[1].items():
-            self._by_name[name].change(variables, parameters, only_checks=only_checks)
-
-    def _activate(self) -> None:
-        self._is_active = True
-        if self._fork is not None:
-            self._change(only_checks=True)
-        for node in self._nodes:
-            node.activate()
-        for node in self._nodes:
-            node.on_timer()
-
-    def _open_middleware(self) -> Middleware:
-        middleware = self._make_middleware(self._files, self._fail_outside_hooks)
-        if self._files[0].time == VIRTUAL:
-            loop = cast(VirtualRun, middleware.loop)
-            loop.plan(self._duration_s, self._end_by_duration, self._real_time_factor)
-            if self._fork is not None:
-                loop.call_at(self._fork[0], functools.partial(self._change, only_checks=False))
-        with self._early_lock:
-            self._middleware = middleware
-            for event in self._early_events:
-                middleware.loop.post_from_thread(event)
-        return middleware
+        for name, (variables, parameters) in (self._fork or (0.0, {}))[1].items():
+            if name in self._nodes:
+                self._nodes[name].change(variables, parameters, only_checks=only_checks)
 
     def _end_by_duration(self) -> None:
         reason = f"{self._duration_s:g} s of virtual time have passed"
@@ -366,7 +368,11 @@ class NodeProcess:
     @property
     def is_ending(self) -> bool:
         """Whether no further hook starts."""
-        return self._stop_asked.is_set() or self._has_failed
+        return self._stage is ProcessStage.ENDING
+
+    def _reach(self, stage: ProcessStage) -> None:
+        with self._stage_lock:  # the control thread may end what the loop begins
+            self._stage = max(self._stage, stage)
 
     def _guard(self, action: Event) -> None:
         """A failure anywhere must not keep the others from finalising."""
@@ -390,8 +396,7 @@ class NodeProcess:
             is_held=self._is_held,
             on_initialised=self._keep_for_good,
         )
-        self._nodes.append(node)
-        self._by_name[node.name] = node
+        self._nodes[node.name] = node
 
     def _keep_for_good(self) -> None:
         """Leave what exists after initialisation to itself: modules, networks, figures.
@@ -403,15 +408,6 @@ class NodeProcess:
             gc.collect()
             gc.freeze()
 
-    def _has_free_threads(self) -> bool:
-        """Whether there is a thread, besides NeuROS's own, that does not wait for a connection."""
-        bound = {threading.main_thread(), threading.current_thread()}
-        bound.update(*(node.waiting_threads for node in self._nodes))
-        return any(
-            thread not in bound and not isinstance(thread, ControlThread)
-            for thread in threading.enumerate()
-        )
-
     def _tell(self, message: Message) -> None:
         assert self._link is not None
         with self._tell_lock:
@@ -419,9 +415,9 @@ class NodeProcess:
 
     def _fail(self, name: str, error: NeurosError) -> None:
         self._has_failed = True
-        node = next((node for node in self._nodes if node.name == name), None)
-        if node is not None:
-            node.failures.log(error)
+        self._reach(ProcessStage.ENDING)
+        if name in self._nodes:
+            self._nodes[name].failures.log(error)
         else:  # there is no logger yet
             traceback.print_exception(error, file=sys.stderr)
         self._tell(control.Failed(name, str(error)))
@@ -433,9 +429,10 @@ class NodeProcess:
             known = error if isinstance(error, NeurosError) else as_node_error(error)
             self._fail(self._files[0].node.name, known)
             return
-        names = set(_filenames(error))
-        suspects = [node for node in self._nodes if str(node.file.node.plugin) in names]
-        node = next((node for node in suspects if node.has_context), (suspects or self._nodes)[0])
+        nodes = [*self._nodes.values()]
+        names = {frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)}
+        suspects = [node for node in nodes if str(node.file.node.plugin) in names]
+        node = next((node for node in suspects if node.has_context), (suspects or nodes)[0])
         if not isinstance(error, NeurosError):
             error = callback_error(error)
         self._fail(node.name, error)
@@ -461,8 +458,8 @@ class ControlThread(threading.Thread):
         self._ended = threading.Event()
         # Here: once the thread comes to it, a node that fails at once may have closed them.
         self._selector = selectors.DefaultSelector()
-        self._selector.register(link, selectors.EVENT_READ, self._on_messages)
-        self._selector.register(signalled, selectors.EVENT_READ, self._on_signal)
+        self._selector.register(link, selectors.EVENT_READ)
+        self._selector.register(signalled, selectors.EVENT_READ)
 
     def run(self) -> None:
         """Until the supervisor hangs up or :meth:`end`."""
@@ -471,7 +468,12 @@ class ControlThread(threading.Thread):
             while not self._ended.is_set():
                 ready = selector.select(max(0.0, next_report_s - time.monotonic()))
                 for key, _ in ready:
-                    if not key.data():
+                    if key.fileobj is self._signalled:
+                        with contextlib.suppress(OSError):
+                            self._signalled.recv(64)
+                            if not self._ended.is_set():
+                                self._process.ask_to_stop()
+                    elif not self._handle_messages():
                         return
                 if time.monotonic() >= next_report_s and not self._ended.is_set():
                     next_report_s = time.monotonic() + _REPORT_S
@@ -483,29 +485,19 @@ class ControlThread(threading.Thread):
         waker.send(b"\0")
         self.join(_REPORT_S)
 
-    def _on_signal(self) -> bool:
-        with contextlib.suppress(OSError):
-            self._signalled.recv(64)
-            if not self._ended.is_set():
-                self._process.ask_to_stop()
-        return True
-
-    def _on_messages(self) -> bool:
+    def _handle_messages(self) -> bool:
         """Returns False once the supervisor is gone."""
-        messages = self._received(self._link)
-        if messages is None:
-            self._process.let_go()
-            return False
-        for message in messages:
-            self._try(functools.partial(self._process.obey, message))
-        return True
-
-    def _received(self, link: ControlLink) -> list[Message] | None:
         try:
-            return link.receive()
+            messages = self._link.receive()
         except ControlError as error:
             self._raise_in_loop(error)
-            return []
+            return True
+        if messages is None:
+            self._process.on_supervisor_gone()
+            return False
+        for message in messages:
+            self._try(functools.partial(self._process.handle, message))
+        return True
 
     def _try(self, action: Event) -> None:
         try:
@@ -537,40 +529,31 @@ def signals_as_socket() -> Iterator[tuple[socket.socket, socket.socket]]:
         writer.close()
 
 
-def _at_rest(nodes: Sequence[NodeRuntime], asked: Advance) -> control.AtRest:
-    """Times and new packets of all nodes of a process at one moment."""
+def _at_rest(nodes: Mapping[str, NodeRuntime], asked: Advance) -> control.AtRest:
+    """Times, counters and new packets of all nodes of a process at one moment."""
     packets = {
         name: (history.count, history.since(asked.known[name]))
-        for node in nodes
+        for node in nodes.values()
         for output, history in node.histories.by_output.items()
         if (name := f"{node.name}.{output}") in asked.known and history.count > asked.known[name]
     }
-    times = {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None}
-    return control.AtRest(asked.number, times, packets)
-
-
-def _with_counters(answer: control.AtRest, nodes: Sequence[NodeRuntime]) -> control.AtRest:
-    """The answer with what the supervisor compares with those of other processes."""
-    answer.nodes = names = tuple(node.name for node in nodes)
-    engines = [node.engine for node in nodes if node.engine is not None]
-    answer.is_active = len(engines) == len(nodes) and all(e.is_active for e in engines)
-    answer.sent = {
-        str(w.connection): (w.sent, w.acknowledged if w.is_reliable else -1)
-        for engine in engines
-        for w in engine.send_windows.values()
-        if w.connection.destination_node not in names
-    }
-    answer.received = {
-        s.name: (s.received, s.acknowledged if s.is_acknowledged else -1)
-        for engine in engines
-        for s in engine.subscriptions.values()
-        if isinstance(s.key, Connection) and s.key.source_node not in names
-    }
-    return answer
-
-
-def _filenames(error: BaseException) -> Iterator[str]:
-    trace = error.__traceback__
-    while trace is not None:
-        yield trace.tb_frame.f_code.co_filename
-        trace = trace.tb_next
+    engines = [node.engine for node in nodes.values() if node.engine is not None]
+    return control.AtRest(
+        asked.number,
+        {name: time_s for name, node in nodes.items() if (time_s := node.sim_time) is not None},
+        packets,
+        nodes=tuple(nodes),
+        is_active=len(engines) == len(nodes) and all(e.is_active for e in engines),
+        sent={
+            str(w.connection): (w.sent, w.acknowledged if w.is_reliable else -1)
+            for engine in engines
+            for w in engine.send_windows.values()
+            if w.connection.destination_node not in nodes
+        },
+        received={
+            s.name: (s.received, s.acknowledged if s.is_acknowledged else -1)
+            for engine in engines
+            for s in engine.subscriptions.values()
+            if isinstance(s.key, Connection) and s.key.source_node not in nodes
+        },
+    )

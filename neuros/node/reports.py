@@ -86,14 +86,24 @@ class NodeReports:
 
     def _state(self) -> dict[str, Any]:
         now_ns, engine = self._clock(), self._engine
-        metrics = snapshot(engine, now_ns) if engine and self._has_begun else None
+        metrics: dict[str, Any] | None = None
+        reasons: tuple[str, ...] = ()
+        stack: Stack | None = None
+        if engine and self._has_begun:
+            metrics = snapshot(engine, now_ns)
+            executing = metrics["executing"]
+            reasons = () if executing else tuple(explain(engine, now_ns))
+            is_long = engine.is_stopped or (executing and executing["for_s"] >= LONG_S)
+            if is_long and threading.current_thread() is not _MAIN:  # which is between two hooks
+                stack = stack_in(self._file.node.name, self._file.node.plugin)
         return {
             "node": self._file.node.name,
             "waiting_for": tuple(str(each) for each in self._transport.waiting_for()),
             **self._time.report(now_ns),
             "running_since_s": engine.tick_start_ns / 1e9 if engine and engine.is_running else None,
             "metrics": metrics,
-            "stack": self._stack(metrics),
+            "reasons": reasons,
+            "stack": stack,
             "fault": self._fault,
             "compressed": self._transport.compressed,
             "is_driving": engine is not None and engine.is_driving,
@@ -110,17 +120,7 @@ class NodeReports:
                 return f"node '{self._file.node.name}': {part.failure}"
         return None
 
-    def _stack(self, metrics: Mapping[str, Any] | None) -> Stack | None:
-        """The stack of the plugin, if its hook runs for long, or the node is to end."""
-        engine = self._engine
-        if engine is None or metrics is None or threading.current_thread() is _MAIN:
-            return None
-        executing = metrics["executing"]
-        if engine.is_stopped or (executing is not None and executing["for_s"] >= LONG_S):
-            return stack_in(self._file.node.name, self._file.node.plugin)
-        return None
-
-    def look(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> NodeStatus:
+    def status(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> NodeStatus:
         """What an observer is shown: the node, and what was sampled of its packets. Any thread.
 
         Args:
@@ -138,7 +138,7 @@ class NodeReports:
         )
 
     def probe(self, number: int, *, is_idle: bool, has_free_threads: bool) -> Probed:
-        """The report with what only a moment between two events can tell. Loop thread only.
+        """A report between two events, with what can be known only then. Loop thread only.
 
         A thread of a plugin may submit packets, or end the project, at any time.
         """
@@ -153,13 +153,6 @@ class NodeReports:
             or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file)),
             is_idle=is_idle,
         )
-
-    def explain(self) -> list[str]:
-        """Why nothing moves here. Any thread."""
-        engine = self._engine
-        if engine is None:
-            return [f"imports its plugin {self._file.node.plugin_name}"]
-        return explain(engine, self._clock())
 
 
 def declared(node: str, specs: Sequence[HookSpec]) -> Hooks:

@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 from neuros.control import WORLD
-from neuros.node.instruments import Observe, Tap
+from neuros.node.instruments import Observe, Passage
 from neuros.ports import Way, WorldLook
 from neuros.time import to_seconds
 
@@ -57,8 +57,8 @@ class _Request:
         is_gathered = all(batch.is_full for batch in batches)
         return has_values and is_gathered and not self._wants_all and not self._wants_image
 
-    def look_at(self, packet: Any) -> None:
-        """Take from a packet what is wanted; what cannot be taken is no fault of the node's."""
+    def sample(self, packet: Any) -> None:
+        """Sample a packet; what cannot be read of it is no fault of the node's."""
         try:
             if self._paths and len(self._values) < MOST_VALUES:
                 values = [number_at(packet, path) for path in self._paths]
@@ -111,7 +111,7 @@ class _ArrayMessage:
 
 
 class Sampler:
-    """Looks at packets for observers.
+    """Samples packets for observers.
 
     Attributes:
         requests: by port (an output's name, or the topic of an external input), what is wanted by
@@ -123,26 +123,26 @@ class Sampler:
         self.requests: dict[str, list[_Request]] = {}
         self.look_at_world: WorldLook | None = None
         self._asked: dict[int, dict[str, _Request]] = {}
-        self._taps: list[tuple[str, Tap, Observe]] = []
+        self._passages: list[tuple[str, Passage, Observe]] = []
 
-    def attach(self, tap: Tap) -> None:
-        """Look at the packets there while they are asked for."""
-        if tap.way is not Way.RECEIVED:
-            port = tap.port.external_topic if tap.way is Way.HEARD else tap.port.name
-            name, is_array = str(port), tap.port.array is not None
+    def attach(self, passage: Passage) -> None:
+        """Sample the packets of a passage while an observer asks for them."""
+        if passage.way is not Way.RECEIVED:
+            port = passage.port.external_topic if passage.way is Way.HEARD else passage.port.name
+            name, is_array = str(port), passage.port.array is not None
 
             def observe(packet: Any, _: bytes | None) -> None:
-                self.note(name, _ArrayMessage(packet) if is_array else packet)
+                self.sample(name, _ArrayMessage(packet) if is_array else packet)
 
-            self._taps.append((name, tap, observe))
+            self._passages.append((name, passage, observe))
 
-    def note(self, port: str, packet: Any) -> None:
+    def sample(self, port: str, packet: Any) -> None:
         """A packet passes. The thread of the hooks only."""
         waiting = self.requests  # the next question, which may come meanwhile, brings another one
         requests = waiting.get(port)
         if requests is not None:
             for request in requests:
-                request.look_at(packet)
+                request.sample(packet)
             if all(request.is_met for request in requests):
                 del waiting[port]
 
@@ -172,10 +172,10 @@ class Sampler:
                 if not request.is_met:
                     waiting.setdefault(port, []).append(request)
         self.requests = waiting
-        for name, tap, observe in self._taps:
-            tap.remove(observe)
+        for name, passage, observe in self._passages:
+            passage.remove(observe)
             if name in waiting:
-                tap.add(observe)
+                passage.add(observe)
         return answers
 
 
@@ -351,11 +351,11 @@ class SpikeBatch:
 
     @property
     def is_full(self) -> bool:
-        """Whether no further packet is looked at, so that a page that was left costs nothing."""
+        """Whether no further packet is read, so that a page that nobody reads costs nothing."""
         return self._packets >= MOST_PACKETS or self._count > 2 * MOST_SPIKES
 
     def add(self, packet: Any) -> None:
-        """Take the spikes of a packet.
+        """Add the spikes of a packet.
 
         Raises:
             ValueError: if senders and times are not of one length.
@@ -404,11 +404,11 @@ class ArrayBatch:
 
     @property
     def is_full(self) -> bool:
-        """Whether no further packet is looked at."""
+        """Whether no further packet is read."""
         return self._packets >= MOST_ARRAYS
 
     def add(self, packet: Any) -> None:
-        """Take the array of a packet.
+        """Add the array of a packet.
 
         Raises:
             AttributeError, LookupError, TypeError, ValueError: if there is no array of numbers.

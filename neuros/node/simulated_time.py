@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from neuros.engine.sim_clock import SimClock
-from neuros.node.instruments import Tap
+from neuros.node.instruments import Passage
 from neuros.ports import Way
 from neuros.project.model import CLOCK_TYPE, Node
 from neuros.time import to_seconds, to_stamp
@@ -85,22 +85,22 @@ class SimulatedTime:
         self._timeline = Timeline()
 
     def own(self, read_s: Callable[[], float]) -> None:
-        """Take it from a simulator, rather than from a clock that the node publishes."""
+        """Read the time from a simulator, not from a clock that the node publishes."""
         self._read_s = read_s
         self._is_owned = True
 
-    def attach(self, tap: Tap) -> None:
-        """Take the time of clocks that are published there."""
-        if tap.way is Way.SENT and tap.port.type == CLOCK_TYPE:
-            tap.add(self._hear)
+    def attach(self, passage: Passage) -> None:
+        """Read the time from clocks that the node publishes."""
+        if passage.way is Way.SENT and passage.port.type == CLOCK_TYPE:
+            passage.add(self._on_clock)
 
-    def _hear(self, packet: Any, _: bytes | None) -> None:
+    def _on_clock(self, packet: Any, _: bytes | None) -> None:
         if self._is_owned:
             return
         seconds = to_seconds(packet)
         self._read_s = lambda: seconds
         if self.is_watched:
-            self.look()
+            self.update()
 
     @property
     def is_over(self) -> bool:
@@ -109,12 +109,12 @@ class SimulatedTime:
             return False
         return time_s >= self._duration_s - 1e-9
 
-    def look(self) -> None:
+    def update(self) -> None:
         """It may have gone on; it may be over."""
-        time_s = self.now_s
-        if time_s is None:
+        if self._read_s is None:
             return
-        self._timeline.note(time_s, self._clock() / 1e9)
+        time_s = self._read_s()
+        self._timeline.add(time_s, self._clock() / 1e9)
         if self._duration_s is not None and self.is_over and not self._has_told:
             self._has_told = True
             self._on_over(self._duration_s)
@@ -123,16 +123,16 @@ class SimulatedTime:
         """The time, and the points ``(simulated, wall)`` since this was last asked. Any thread."""
         time_s = self.now_s
         if self.is_watched and time_s is not None:
-            self._timeline.note(time_s, now_ns / 1e9)
+            self._timeline.add(time_s, now_ns / 1e9)
         return {
             "sim_time": time_s,
             "expected_end_s": self.expected_end_s,
-            "timeline": self._timeline.take(),
+            "timeline": self._timeline.pop(),
         }
 
 
 class Timeline:
-    """Collects points of simulated and wall time until they are taken. Any thread.
+    """Collects points of simulated and wall time until :meth:`pop`. Any thread.
 
     Two threads that note one second at one moment may leave it there twice.
     """
@@ -144,7 +144,7 @@ class Timeline:
         self._last = (-math.inf, -math.inf)
         self._points: list[tuple[float, float]] = []
 
-    def note(self, sim_s: float, wall_s: float) -> None:
+    def add(self, sim_s: float, wall_s: float) -> None:
         """It is ``sim_s`` now; the first reading in each simulated second is kept.
 
         Where time goes back, since a simulator was reset, so are the last reading and the new one.
@@ -163,7 +163,7 @@ class Timeline:
             self._next_wall_s = wall_s + _FINE_INTERVAL_S
             self._points.append((sim_s, wall_s))
 
-    def take(self) -> list[tuple[float, float]]:
+    def pop(self) -> list[tuple[float, float]]:
         """The points ``(simulated, wall)`` since this was last asked."""
         count = len(self._points)
         taken = self._points[:count]

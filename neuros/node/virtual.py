@@ -37,10 +37,24 @@ class Durations:
         self._sim_time_s = sim_time_s
         self._since_ns = 0
         self._draws: dict[Hook, Draws] = {}
+        self._declared_ns: int | None = None
 
     def begin(self, hook: Hook) -> None:
         """A hook starts."""
         self._since_ns = self._sim_ns()
+        self._declared_ns = None
+        if hook.spec.kind is HookKind.INITIALISE:
+            return
+        duration = self._node.durations.get(hook.name)
+        if duration is not None:
+            draws = self._draws.get(hook)
+            if draws is None:
+                draws = Draws(self._loop.seed, "hook", self._node.name, hook.name)
+                self._draws[hook] = draws
+            is_constant = duration.kind == "constant"
+            share = 0.5 if is_constant else draws.share(hook.executions + 1)
+            self._declared_ns = duration.at_ns(share)
+        self._loop.announce(self._declared_ns or 0)
 
     def end(self, hook: Hook) -> None:
         """The function of the hook has returned: the node is held for the duration.
@@ -50,19 +64,11 @@ class Durations:
         """
         if hook.spec.kind is HookKind.INITIALISE:
             return
-        duration = self._node.durations.get(hook.name)
-        if duration is None:
+        duration_ns = self._declared_ns
+        if duration_ns is None:
             duration_ns = max(0, self._sim_ns() - self._since_ns)
             if not duration_ns and hook.drives and hook.spec.kind is HookKind.FUNCTION:
                 raise hook.error(": ".join(self._node.timeless(hook.name)))
-        else:
-            draws = self._draws.get(hook)
-            if draws is None:
-                draws = Draws(self._loop.seed, "hook", self._node.name, hook.name)
-                self._draws[hook] = draws
-            is_constant = duration.kind == "constant"
-            share = 0.5 if is_constant else draws.share(hook.executions + 1)
-            duration_ns = duration.at_ns(share)
         self._loop.hold(duration_ns)
         if self._loop.starts > _MOST_STARTS:
             raise hook.error(

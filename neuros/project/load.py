@@ -311,6 +311,7 @@ def load_project(
         budgets=Budgets(**{**budgets, "lost_packets": lost}),
         names=names,
         dashboard=dashboard_of(parsed),
+        is_portable=parsed.root.plain.get("portable", False),
         time=parsed.root.string("time") or REAL,
     )
     loose = [*unconnected_ports(parsed)]

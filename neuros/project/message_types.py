@@ -12,7 +12,7 @@ import importlib.util
 import math
 import re
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -58,6 +58,9 @@ class MessagePackages(Protocol):
     def messages(self, package: str) -> Collection[str] | None:
         """The names of a package's messages, ``None`` if there is no such package."""
 
+    def elsewhere(self, package: str, name: str) -> str:
+        """The wrong folder in which a package has a message, in a sentence; empty if in none."""
+
     def installed(self, package: str) -> Path | None:
         """The folder of the built package, ``None`` if there is no such package."""
 
@@ -70,6 +73,9 @@ class NoPackages:
 
     def messages(self, package: str) -> None:
         return None
+
+    def elsewhere(self, package: str, name: str) -> str:
+        return ""
 
     def installed(self, package: str) -> None:
         return None
@@ -221,21 +227,21 @@ def unknown_type(
     folder = message_folder(package)
     own = packages.messages(package) if folder is None else None
     if own is not None:
-        return None if name in own else _no_message(type_name, own)
+        if name in own:
+            return None
+        text, hint = _no_message(type_name, own)
+        return text, packages.elsewhere(package, name) or hint
     if folder is None:
         if not must_be_here:
             return None
-        # Most names end in _msgs, which would make all of them similar.
-        ending = "_msgs" if package.endswith("_msgs") else ""
         others = {
-            init.parents[1].name.removesuffix(ending)
+            init.parents[1].name
             for path in sys.path
-            for init in Path(path).glob(f"*{ending or '_*'}/msg/__init__.py")
+            for init in Path(path).glob("*_*/msg/__init__.py")
         }
-        similar = did_you_mean(package.removesuffix(ending), others).replace("'?", f"{ending}'?")
         return (
             f"unknown message type '{type_name}': there is no message package '{package}' here",
-            similar
+            similar_package(package, others)
             or f"a message of your own is workspace/{package}/msg/{name}.msg beside the project"
             f" file, with workspace/{package}/package.xml: docs/messages.md",
         )
@@ -243,6 +249,14 @@ def unknown_type(
     if name in names or imported(package, name) is not None:
         return None
     return _no_message(type_name, names)
+
+
+def similar_package(package: str, others: Iterable[str]) -> str:
+    """A hint at the message package that may be meant; empty if none is similar."""
+    # Most names end in _msgs, which would make all of them similar.
+    ending = "_msgs" if package.endswith("_msgs") else ""
+    stems = {each.removesuffix(ending) for each in others if each.endswith(ending)}
+    return did_you_mean(package.removesuffix(ending), stems).replace("'?", f"{ending}'?")
 
 
 def _no_message(type_name: str, names: Collection[str]) -> tuple[str, str]:

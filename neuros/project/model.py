@@ -374,6 +374,7 @@ class Project:
 
     Attributes:
         dashboard: the layout of the dashboard in the file, ``None`` if it has none.
+        is_portable: whether its runs fix what libraries choose by the processor.
         time: the clock of a run, ``real`` or ``virtual``.
     """
 
@@ -385,6 +386,7 @@ class Project:
     budgets: Budgets = Budgets()
     names: Names = _NO_NAMES
     dashboard: Mapping[str, Any] | None = field(default=None, hash=False)
+    is_portable: bool = False
     time: str = REAL
 
     @property

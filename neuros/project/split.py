@@ -148,6 +148,8 @@ def project_to_json(project: Project) -> dict[str, Any]:
     ]
     content["connections"] = [connection.keys for connection in project.connections]
     content |= names_to_json(project.names)
+    if project.is_portable:
+        content["portable"] = True
     if project.is_virtual:
         content["time"] = project.time
     if budgets := budgets_to_json(project.budgets):

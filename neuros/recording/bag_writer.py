@@ -16,11 +16,12 @@ from typing import Any
 
 from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.msg import normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault
-from neuros.ordinary_files import folder_in, write_whole
+from neuros.ordinary_files import write_whole
 from neuros.project.message_types import message_folder, normalised
 from neuros.recording.recording_plan import Topic
 
@@ -86,8 +87,7 @@ class BagWriter:
         path.mkdir(parents=True)
         self.counts: dict[int, int] = {}
         self._path, self._custom = path, dict(custom)
-        with folder_in(path.parent, path.name) as folder:
-            self._file = (folder / f"{path.name}.mcap").open("xb")
+        self._file = (path / f"{path.name}.mcap").open("xb")
         # Compression of images took 2.7 times the processor time, for 0.6 times the size.
         self._mcap = Writer(self._file, compression=CompressionType.NONE)
         self._mcap.start("ros2", f"neuros-{__version__}")
@@ -96,15 +96,22 @@ class BagWriter:
         self._topics: list[dict[str, Any]] = []
         self._first_ns, self._last_ns = _LAST_NS, 0
 
-    def add_topic(self, topic: Topic) -> int:
+    def add_topic(self, topic: Topic, types: Typestore | None = None) -> int:
         """The number of a new topic, for :meth:`put`.
+
+        Args:
+            types: has the definition of its type, which is that of the first topic of the type;
+                ``None``: the installed one.
 
         Raises:
             EnvironmentFault: if the definition of its type is not installed.
         """
-        define(topic.type, self._types)
+        if types is None:
+            types = self._types
+            define(topic.type, types)
+        name = normalize_msgtype(topic.type)  # differs for a service event
         if topic.type not in self._schemas:
-            definition, _ = self._types.generate_msgdef(topic.type, ros_version=2)
+            definition, _ = types.generate_msgdef(name, ros_version=2)
             schema = self._mcap.register_schema(topic.type, "ros2msg", definition.encode())
             self._schemas[topic.type] = schema
         qos = [
@@ -130,7 +137,7 @@ class BagWriter:
                 "type": topic.type,
                 "serialization_format": "cdr",
                 "offered_qos_profiles": qos,
-                "type_description_hash": self._types.hash_rihs01(topic.type),
+                "type_description_hash": types.hash_rihs01(name),
             }
         )
         return number
@@ -175,8 +182,7 @@ class BagWriter:
             self._mcap.finish()
             self._file.close()
             text = _yaml({"rosbag2_bagfile_information": information})
-            with folder_in(self._path.parent, self._path.name) as folder:
-                write_whole(folder / "metadata.yaml", f"{text}\n".encode())
+            write_whole(self._path / "metadata.yaml", f"{text}\n".encode())
         finally:
             self.shut()
 

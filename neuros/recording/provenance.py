@@ -13,6 +13,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from neuros.arithmetic import ARITHMETIC, processor
 from neuros.distribution import __version__
 from neuros.project.model import Node
 from neuros.project.scanner import read_bytes
@@ -28,7 +29,8 @@ def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) 
     Args:
         command: the command line.
         nodes: all nodes of the project.
-        run_folder: has the versions of each node (:func:`note_versions`).
+        run_folder: has the versions of each node (:func:`note_versions`), and what its arithmetic
+            depends on (:func:`~neuros.arithmetic.note_arithmetic`).
     """
     nodes = list(nodes)
     own = python_versions()
@@ -41,8 +43,13 @@ def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) 
             "nodes": {
                 node.name: noted
                 for node in nodes
-                if (noted := _noted_versions(run_folder / node.name)) not in (None, own)
+                if (noted := _noted(run_folder / node.name / _VERSIONS)) not in (None, own)
             },
+        },
+        "arithmetic": {
+            node.name: noted
+            for node in nodes
+            if (noted := _noted(run_folder / node.name / ARITHMETIC)) is not None
         },
         "machine": machine(),
         "seeds": seeds(nodes),
@@ -64,9 +71,9 @@ def note_versions(node_folder: Path) -> None:
         (node_folder / _VERSIONS).write_text(json.dumps(python_versions(), indent=2), "utf-8")
 
 
-def _noted_versions(node_folder: Path) -> Any:
+def _noted(file: Path) -> Any:
     try:
-        return json.loads(read_bytes(node_folder / _VERSIONS))
+        return json.loads(read_bytes(file))
     except (OSError, ValueError, RecursionError):  # the node never began, or the disk was full
         return None
 
@@ -88,7 +95,7 @@ def machine() -> dict[str, Any]:
     """Name, processor, cores, memory in bytes and system of this machine."""
     return {
         "name": platform.node(),
-        "processor": _first("/proc/cpuinfo", "model name") or platform.machine(),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "usable_cores": len(os.sched_getaffinity(0)),
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),

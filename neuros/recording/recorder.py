@@ -38,7 +38,7 @@ from neuros.recording.spool import (
     forget_listened,
     listened_topics,
 )
-from neuros.recording.stored import contents_of, faults_of, is_whole, stored_messages
+from neuros.recording.stored import StoredBag, faults_of, is_whole, stored_messages
 
 # A packet is in its spool this long after its time, unless its process was kept from running.
 # Readers of bags sort, so a packet that comes later does no harm.
@@ -309,7 +309,9 @@ def repair(
             spools = (SpoolReader(run / name) for name in (*plan.streams, LISTENER))
             if not is_alone or any(spool.is_fed for spool in spools):
                 raise EnvironmentFault(f"{run} is still being recorded: wait for its end")
-            if not needs_repair(run, plan) and not faults_of(run / BAG_NAME, counts_of(run)):
+            if not needs_repair(run, plan) and not faults_of(
+                StoredBag(run / BAG_NAME), counts_of(run)
+            ):
                 return None
             return _rebuild(run, plan, complain, keeps_changed=keeps_changed)
     except OSError as error:
@@ -348,7 +350,8 @@ def named(lost: Mapping[str, int]) -> str:
 def counts_of(run: Path) -> dict[str, int]:
     """Packets in the bag of a run, by topic. Raises ``OSError`` if it cannot be read."""
     try:
-        return {each.topic: each.msgcount for each in contents_of(run / BAG_NAME).connections}
+        topics = StoredBag(run / BAG_NAME).contents().connections.values()
+        return {each.topic: each.msgcount for each in topics}
     except EnvironmentFault as error:
         raise OSError(errno.EIO, str(error)) from error
 

@@ -127,12 +127,9 @@ def _why_no_plan(run: Path) -> str:
     if not run.exists():
         return f"{run}: there is no such file or folder"
     if not run.is_dir():
-        return f"{run} is a file: give the folder of a run, or of a bag (with metadata.yaml)"
+        return f"{run} is a file: give the folder of a run, or a bag (a folder, .mcap or .db3)"
     if (run / "run.json").exists() or any(run.glob("*/node.json")):
         return f"{run} was not recorded: launch the project with -r, or name topics with -t"
-    files = sorted(each.name for pattern in ("*.mcap", "*.db3") for each in run.glob(pattern))
-    if files:
-        return f"{run} has {files[0]}, but no metadata.yaml: `ros2 bag reindex` writes it anew"
     return f"{run} is the folder of neither a run nor a bag: it has no run.json, no metadata.yaml"
 
 

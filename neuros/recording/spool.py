@@ -19,14 +19,13 @@ import re
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
 from neuros.control.link import read_as
 from neuros.errors import ControlError
-from neuros.ordinary_files import descriptor_of, folder_in, write_whole
+from neuros.ordinary_files import write_whole
 from neuros.ports import Way
 from neuros.project.scanner import read_bytes
 from neuros.recording.recording_plan import LISTENER, RecordedStream, RecordingPlan, Topic
@@ -128,8 +127,9 @@ class SpoolWriter:
     def _begin_file(self) -> None:
         self.close()
         flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_APPEND
-        with folder_in(self._folder.parent, self._folder.name, _FOLDER, makes=True) as folder:
-            self._descriptor = os.open(_path(folder, self._files), flags, 0o644)
+        folder = self._folder / _FOLDER
+        folder.mkdir(parents=True, exist_ok=True)
+        self._descriptor = os.open(_path(folder, self._files), flags, 0o644)
         fcntl.flock(self._descriptor, fcntl.LOCK_SH)  # until it is closed
         self._files += 1
         self._size = 0
@@ -210,8 +210,8 @@ class SpoolReader:
     def remove_up_to(self, wall_ns: int) -> None:
         """Remove the files that were read to their end, if all packets are up to ``wall_ns``."""
         while self._done and self._done[0][1] <= wall_ns:
-            with contextlib.suppress(OSError), self._spool() as spool:
-                _path(spool, self._done[0][0]).unlink()
+            with contextlib.suppress(OSError):
+                _path(self._folder / _FOLDER, self._done[0][0]).unlink()
             del self._done[0]
 
     def close(self, *, remove: bool) -> None:
@@ -220,23 +220,18 @@ class SpoolReader:
             self._close_file()
         if remove:
             self.remove_up_to(self._last_ns)
-            with (
-                contextlib.suppress(OSError),
-                folder_in(self._folder.parent, self._folder.name) as folder,
-            ):
-                (folder / _FOLDER).rmdir()
-
-    def _spool(self) -> AbstractContextManager[Path]:
-        return folder_in(self._folder.parent, self._folder.name, _FOLDER)
+            with contextlib.suppress(OSError):
+                (self._folder / _FOLDER).rmdir()
 
     def _open(self, number: int) -> int:
-        with self._spool() as spool:
-            return descriptor_of(_path(spool, number), os.O_NOFOLLOW)
+        return os.open(_path(self._folder / _FOLDER, number), os.O_RDONLY)
 
     def _numbers(self) -> list[int]:
-        with contextlib.suppress(FileNotFoundError), self._spool() as spool:
-            return sorted(int(name) for name in os.listdir(spool) if _NAME.fullmatch(name))
-        return []
+        try:
+            names = os.listdir(self._folder / _FOLDER)
+        except FileNotFoundError:
+            return []
+        return sorted(int(name) for name in names if _NAME.fullmatch(name))
 
     @property
     def _has_more(self) -> bool:
@@ -296,8 +291,8 @@ class ListenedSpool:
         """The number of a new topic. Raises ``OSError``."""
         self._topics.append(topic)
         text = json.dumps([asdict(each) for each in self._topics])
-        with folder_in(self._run, LISTENER, makes=True) as folder:
-            write_whole(folder / _LIST, text.encode())
+        (self._run / LISTENER).mkdir(exist_ok=True)
+        write_whole(self._run / LISTENER / _LIST, text.encode())
         return len(self._topics) - 1
 
     def keep(self, number: int, wall_ns: int, data: bytes) -> None:
@@ -334,7 +329,6 @@ def listened_topics(run: Path) -> list[Topic]:
 def forget_listened(run: Path) -> None:
     """Remove the list of topics, if possible; its spool must have been removed before."""
     with contextlib.suppress(OSError):
-        with folder_in(run, LISTENER) as folder:
-            for name in (_LIST, f".{_LIST}"):
-                (folder / name).unlink(missing_ok=True)
+        for name in (_LIST, f".{_LIST}"):
+            (run / LISTENER / name).unlink(missing_ok=True)
         (run / LISTENER).rmdir()

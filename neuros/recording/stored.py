@@ -1,106 +1,278 @@
-"""Reader of bags, also of damaged ones.
+"""Reader of bags: of NeuROS, of every version of rosbag2, and of others; also of damaged ones.
 
-The ``mcap`` library reads MCAP files, since ``rosbags`` gives a message only one time, and needs an
-index, which the file of a killed run lacks. ``rosbags`` reads all other formats. Checksums of
-chunks and of the summary reveal damage.
+A bag is a folder, with ``metadata.yaml`` or without, or a single file; its files are of any storage
+(:mod:`neuros.recording.storages`), compressed as a whole, by chunk or by message, or not at all.
 """
 
 from __future__ import annotations
 
-import os
-import re
+import shutil
+import sys
+import weakref
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
-from io import BytesIO
-from pathlib import Path
-from struct import Struct, unpack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePath
+from tempfile import mkdtemp
 from textwrap import shorten
-from typing import Any, BinaryIO, NamedTuple
-from zlib import crc32
+from typing import NamedTuple
 
-from mcap.data_stream import ReadDataStream
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, ChunkIndex, McapRecord, Message, Schema
-from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
-from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
-from rosbags.interfaces import (
-    Connection,
-    ConnectionExtRosbag2,
-    MessageDefinition,
-    MessageDefinitionFormat,
-)
-from rosbags.rosbag2 import Reader, ReaderError
-from rosbags.rosbag2.metadata import parse_qos
-from rosbags.rosbag2.reader import DirectoryReader
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from rosbags.typesys.store import Typestore
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import ReaderError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
-from neuros.errors import EnvironmentFault
+from neuros.errors import EnvironmentFault, UsageError
 from neuros.ordinary_files import open_ordinary
 from neuros.project.scanner import read_bytes
-from neuros.recording.bag_writer import define, types_of_fields
+from neuros.recording.storages import (
+    LAST_NS,
+    SQLITE_MAGIC,
+    Storage,
+    Stored,
+    checkpointed,
+    connection,
+    storage_of,
+)
+from neuros.recording.topic_types import TopicType
 
-_RECORD_HEAD = Struct("<BQ")  # kind, length
-_BY_MESSAGE = re.compile(rb"compression_mode\W+message\b", re.IGNORECASE)
+if sys.version_info >= (3, 14):
+    from compression import zstd
+else:
+    from backports import zstd
+
+METADATA_NAME = "metadata.yaml"
+_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_ROS_1_MAGIC = b"#ROSBAG V"
+_DISTRIBUTIONS = {1: "dashing", 2: "dashing", 3: "eloquent", 4: "foxy", 5: "humble"}
+"""ROS distribution by the version of the metadata; later ones name it."""
 
 
-class Stored(NamedTuple):
-    """A message of a bag; times in nanoseconds.
+class _Metadata(NamedTuple):
+    """What is used of ``metadata.yaml``: names of files, and type and messages of each topic."""
+
+    files: list[str]
+    topics: dict[str, tuple[str, int]]
+    custom: dict[str, str]
+    distribution: str
+
+
+class Contents(NamedTuple):
+    """Topics and times of a bag, the custom data of its metadata, and its ROS distribution.
 
     Attributes:
-        may_have_changed: whether the checksum of its part of the file is wrong.
+        connections: by topic, of all files.
+        distribution: as ``humble``; empty if unknown.
+        notes: sentences about what is odd, and is no damage.
     """
 
-    topic: str
-    log_ns: int
-    publish_ns: int
-    data: bytes
-    may_have_changed: bool = False
+    connections: Mapping[str, Connection]
+    start_ns: int
+    duration_ns: int
+    custom: dict[str, str]
+    distribution: str
+    notes: list[str]
+
+
+class StoredBag:
+    """A bag on the disk.
+
+    A file that is compressed as a whole is decompressed once, into a temporary folder, which goes
+    with this object.
+
+    Args:
+        path: a folder or file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._temporary: str | None = None
+        self._storages: list[Storage] | None = None
+
+    def contents(self) -> Contents:
+        """Read metadata and index; of a bag that was cut off, all of its files.
+
+        Raises:
+            EnvironmentFault: if it cannot be read.
+            UsageError: if it is no bag of ROS 2.
+        """
+        with damage_of(self.path):
+            metadata = self._metadata()
+            is_complete = metadata is not None  # which is written last
+            if metadata is None:
+                for path in self._paths(metadata):
+                    _require_bag(path)
+            parts = [s.contents(is_complete=is_complete) for s in self._files(metadata)]
+            found: dict[str, Connection] = {}
+            for each in (c for part in parts for c in part.connections):
+                before = found.get(each.topic, each._replace(msgcount=0))
+                if before.msgtype != each.msgtype:
+                    raise ReaderError(
+                        f"{each.topic} is of type {before.msgtype}, and {each.msgtype}"
+                    )
+                found[each.topic] = before._replace(msgcount=before.msgcount + each.msgcount)
+            notes = [part.note for part in parts if part.note]
+            if metadata is not None:
+                found, differences = _agreed(metadata, found)
+                notes += differences
+            start_ns = min((part.start_ns for part in parts), default=LAST_NS)
+            end_ns = max((part.end_ns for part in parts), default=0)
+            told = [each.distribution for each in parts if each.distribution]
+            return Contents(
+                found,
+                start_ns,
+                max(0, end_ns - start_ns),
+                metadata.custom if metadata else {},
+                (metadata.distribution if metadata else "") or (told[0] if told else ""),
+                notes,
+            )
+
+    def messages(
+        self, complain: Callable[[str], object] = lambda _: None, only: str | None = None
+    ) -> Iterator[Stored]:
+        """All messages that can be read.
+
+        Args:
+            complain: receives a sentence for each damaged part of a file.
+            only: the topic to read; all if ``None``.
+        """
+        metadata = None
+        with suppress(EnvironmentFault), damage_of(self.path):
+            metadata = self._metadata()
+        try:
+            with damage_of(self.path):
+                files = self._files(metadata)
+        except EnvironmentFault as error:
+            complain(str(error))
+            return
+        for file in files:
+            for stored in file.messages(complain, only):
+                if stored.data[:4] == _ZSTD_MAGIC:  # with which no CDR begins
+                    try:
+                        stored = stored._replace(data=zstd.decompress(stored.data))
+                    except zstd.ZstdError:
+                        complain(f"{self.path}: a message of {stored.topic} is damaged")
+                        continue
+                yield stored
+
+    def _metadata(self) -> _Metadata | None:
+        """Raises any exception if it is damaged."""
+        path = self.path / METADATA_NAME
+        if self.path.is_file() or not path.exists():
+            return None
+        try:
+            found = YAML(typ="safe", pure=False).load(read_bytes(path).decode())
+        except YAMLError as error:
+            raise ReaderError(f"{METADATA_NAME} is no YAML: {error}") from None
+        information = found["rosbag2_bagfile_information"]
+        topics = {}
+        for topic in information["topics_with_message_count"]:
+            about, count = topic["topic_metadata"], topic["message_count"]
+            if type(count) is not int or count < 0:
+                raise ReaderError(f"{about['name']} has {count} packets")
+            topics[about["name"]] = (about["type"], count)
+        return _Metadata(
+            [PurePath(name).name for name in information["relative_file_paths"]],
+            topics,
+            dict(information.get("custom_data") or {}),
+            str(information.get("ros_distro") or "")
+            or _DISTRIBUTIONS.get(information["version"], ""),
+        )
+
+    def _files(self, metadata: _Metadata | None) -> list[Storage]:
+        """Readers of the files, in their order. Raises ``OSError``, ``ReaderError``."""
+        if self._storages is None:
+            self._storages = [storage_of(self._plain(path)) for path in self._paths(metadata)]
+        return self._storages
+
+    def _paths(self, metadata: _Metadata | None) -> list[Path]:
+        if self.path.is_file():
+            return [self.path]
+        if metadata is None:
+            return bag_files(self.path)
+        paths = [self.path / name for name in metadata.files]
+        if missing := [path.name for path in paths if not path.exists()]:
+            raise ReaderError(f"{METADATA_NAME} names {missing[0]}, which is not there")
+        return paths
+
+    def _plain(self, path: Path) -> Path:
+        """The file, or in its place a decompressed and completed copy."""
+        with open_ordinary(path) as file:
+            begins = file.read(len(SQLITE_MAGIC))
+            is_compressed = begins.startswith(_ZSTD_MAGIC)
+            beside = [path.with_name(f"{path.name}{suffix}") for suffix in ("-wal", "-journal")]
+            logs = [each for each in beside if each.is_file() and each.stat().st_size]
+            if not is_compressed and not (logs and begins == SQLITE_MAGIC):
+                return path
+            if self._temporary is None:
+                self._temporary = mkdtemp(prefix="neuros-bag-")
+                weakref.finalize(self, shutil.rmtree, self._temporary, ignore_errors=True)
+            copy = Path(self._temporary, path.name)
+            file.seek(0)
+            with copy.open("xb") as plain:
+                shutil.copyfileobj(zstd.open(file) if is_compressed else file, plain)
+        for log in logs:
+            shutil.copyfile(log, copy.with_name(log.name))
+        if logs:
+            checkpointed(copy)
+        return copy
+
+
+def _require_bag(path: Path) -> None:
+    """Raise ``UsageError`` for a file that is none of a bag of ROS 2; ``OSError``."""
+    with open_ordinary(path) as file:
+        begins = file.read(len(SQLITE_MAGIC))
+    if begins.startswith(_ROS_1_MAGIC):
+        raise UsageError(
+            f"{path} is a bag of ROS 1: `rosbags-convert --src {path} --dst FOLDER` makes one of"
+            " ROS 2"
+        )
+    known = (SQLITE_MAGIC, _ZSTD_MAGIC, MCAP0_MAGIC)
+    # One that was cut off may be shorter.
+    if not any(begins[: len(magic)] == magic[: len(begins)] for magic in known):
+        raise UsageError(f"{path} is no bag: it begins neither as MCAP nor as SQLite")
+
+
+def bag_files(folder: Path) -> list[Path]:
+    """Files of bags in a folder."""
+    found = (each for each in folder.iterdir() if each.name.endswith(_SUFFIXES))
+    return sorted(found, key=lambda each: (len(each.name), each.name))  # bag_2 before bag_10
 
 
 def stored_messages(
     folder: Path, complain: Callable[[str], object] = lambda _: None, only: str | None = None
 ) -> Iterator[Stored]:
-    """All messages of a bag that can be read.
-
-    Args:
-        complain: receives a sentence for each damaged part of a file.
-        only: the topic to read; all if ``None``.
-    """
-    files, metadata = _mcap_files(folder), folder / "metadata.yaml"
-    if not files or (metadata.exists() and _BY_MESSAGE.search(read_bytes(metadata))):
-        try:
-            with opened(folder) as reader, damage_of(folder):
-                wanted = [each for each in reader.connections if only in (None, each.topic)]
-                for connection, log_ns, data in reader.messages(wanted) if wanted else ():
-                    yield Stored(connection.topic, log_ns, log_ns, data)
-        except EnvironmentFault as error:
-            complain(str(error))
-        return
-    for path in files:
-        with open_ordinary(path) as file:
-            try:
-                summary, is_whole = _summary_of(file), True
-            except Exception:  # of a damaged file, mcap may raise anything
-                summary, is_whole = Summary(), False
-            yield from _of_mcap(file, summary, complain, only, has_index=is_whole)
+    """As :meth:`StoredBag.messages`."""
+    return StoredBag(folder).messages(complain, only)
 
 
-def faults_of(folder: Path, counts: Mapping[str, int]) -> list[str]:
+def faults_of(bag: StoredBag, counts: Mapping[str, int]) -> list[str]:
     """A sentence for each damage of a bag; reads all of it.
 
     Args:
         counts: by topic, how many messages the bag should have.
     """
     faults: list[str] = []
-    found = Counter(message.topic for message in stored_messages(folder, faults.append))
+    found = Counter(message.topic for message in bag.messages(faults.append))
     return faults or [
-        are_left(folder, name, count, found[name])
+        are_left(bag.path, name, count, found[name])
         for name, count in counts.items()
         if found[name] < count
     ]
+
+
+def is_whole(folder: Path) -> bool:
+    """Whether metadata, types, beginning and end of the files of a bag can be read."""
+    try:
+        contents = StoredBag(folder).contents()
+        with damage_of(folder):
+            for recorded in contents.connections.values():
+                TopicType(recorded, contents.distribution, ())
+    except (EnvironmentFault, UsageError):
+        return False
+    return (folder / METADATA_NAME).exists()
 
 
 def are_left(folder: Path, topic: str, count: int, left: int) -> str:
@@ -108,113 +280,16 @@ def are_left(folder: Path, topic: str, count: int, left: int) -> str:
     return f"{folder}: of {count} packets of {topic} {left} are left"
 
 
-def is_whole(folder: Path) -> bool:
-    """Whether metadata, types, beginning and end of the files of a bag can be read."""
-    try:
-        with opened(folder) as reader, damage_of(folder):
-            store_of(reader.connections)
-            return True
-    except EnvironmentFault:
-        return False
-
-
-class Contents(NamedTuple):
-    """Topics and times of a bag, and the custom data of its metadata."""
-
-    connections: list[Connection]
-    start_ns: int
-    duration_ns: int
-    custom: dict[str, str]
-
-
-def contents_of(folder: Path) -> Contents:
-    """Read the metadata and index of a bag; of a bag that was cut off, all of its file.
-
-    Raises:
-        EnvironmentFault: if it cannot be read.
-    """
-    if (folder / "metadata.yaml").exists() or not _mcap_files(folder):
-        with opened(folder) as reader, damage_of(folder):
-            custom = dict(reader.storage.metadata.custom or {})
-            return Contents([*reader.connections], reader.start_time, reader.duration, custom)
-    known, counts, first_ns, last_ns = Summary(), Counter[str](), (1 << 63) - 1, 0
-    for path in _mcap_files(folder):
-        with open_ordinary(path) as file:
-            for message in _of_mcap(file, known, lambda _: None, None, has_index=False):
-                counts[message.topic] += 1
-                first_ns, last_ns = min(first_ns, message.log_ns), max(last_ns, message.log_ns)
-    with damage_of(folder):
-        connections = [
-            Connection(
-                channel.id,
-                channel.topic,
-                known.schemas[channel.schema_id].name,
-                MessageDefinition(
-                    MessageDefinitionFormat.MSG, known.schemas[channel.schema_id].data.decode()
-                ),
-                "",
-                counts[channel.topic],
-                ConnectionExtRosbag2("cdr", parse_qos(channel.metadata["offered_qos_profiles"])),
-                None,
-            )
-            for channel in known.channels.values()
-        ]
-    return Contents(connections, first_ns, max(0, last_ns - first_ns), {})
-
-
-@contextmanager
-def opened(folder: Path) -> Iterator[Reader]:
-    """Open a bag with ``rosbags``.
-
-    Raises:
-        EnvironmentFault: if that fails.
-    """
-    with ExitStack() as stack:
-        with damage_of(folder):
-            for path in folder.glob("*"):
-                if path.suffix in (".mcap", ".db3", ".yaml"):
-                    with open_ordinary(path) as file:
-                        if path.suffix == ".mcap":
-                            _summary_of(file)
-            reader = Reader(folder)
-            reader.open()
-            stack.callback(reader.close)
-            _check_definitions(reader)
-        yield reader
-
-
-def store_of(connections: Iterable[Connection]) -> Typestore:
-    """The types that a bag defines; types without a definition (before Iron) as installed.
-
-    Raises:
-        EnvironmentFault: if a type is neither defined nor installed.
-        ReaderError: if a definition lacks the type of a field.
-        Exception: of any kind, if a definition cannot be parsed.
-    """
-    store = get_typestore(Stores.EMPTY)
-    types: dict[str, Any] = {}
-    for connection in connections:
-        if connection.msgdef.format == MessageDefinitionFormat.NONE:
-            define(connection.msgtype, store)
-        else:
-            types |= get_types_from_msg(connection.msgdef.data, connection.msgtype)
-    store.register(types)
-    for name, (_, fields) in types.items():
-        if unknown := next((used for used in types_of_fields(fields) if used not in types), None):
-            raise ReaderError(f"it does not define {unknown}, which {name} has")
-    return store
-
-
 @contextmanager
 def damage_of(folder: Path, what: str = "") -> Iterator[None]:
-    """Turn any exception of ``rosbags`` into ``EnvironmentFault``.
+    """Turn any exception of ``rosbags``, and of other readers, into ``EnvironmentFault``.
 
     Args:
         what: the part of the bag that is read; empty: all of it.
     """
     try:
         yield
-    except EnvironmentFault:
+    except (EnvironmentFault, UsageError):
         raise
     except Exception as error:
         why = shorten(str(error), 200, placeholder=" ...") or type(error).__name__
@@ -222,124 +297,32 @@ def damage_of(folder: Path, what: str = "") -> Iterator[None]:
         raise EnvironmentFault(f"{place} cannot be read: it is damaged ({why})") from error
 
 
-def _check_definitions(reader: Reader) -> None:
-    """Raise ``ReaderError`` where metadata and files do not agree."""
-    folder = reader.storage if isinstance(reader.storage, DirectoryReader) else None
-    if folder and not isinstance(folder.files, list):
-        folder.files = []  # close() needs a list
-        raise ReaderError("in metadata.yaml, files is no list")
-    storages = folder.storages if folder else ()
-    stored = [each for storage in storages for each in storage.connections]
-    there = {(each.topic, each.msgtype) for each in stored}
-    named = {each.topic for each in reader.connections}
-    if unnamed := next((e.topic for e in stored if e.msgcount and e.topic not in named), ""):
-        raise ReaderError(f"metadata.yaml does not name the topic {unnamed}, which its files have")
-    for connection in reader.connections:
-        if type(connection.msgcount) is not int or connection.msgcount < 0:
-            raise ReaderError(f"{connection.topic} has {connection.msgcount} packets")
-        if connection.msgcount and (connection.topic, connection.msgtype) not in there:
-            what = f"{connection.topic} of type {connection.msgtype}"
-            raise ReaderError(f"its files do not have the topic {what}")
-
-
-def _mcap_files(folder: Path) -> list[Path]:
-    return sorted(folder.glob("*.mcap"))
-
-
-def _summary_of(file: BinaryIO) -> Summary:
-    """Channels and chunk indexes of an MCAP file.
+def _agreed(
+    metadata: _Metadata, found: Mapping[str, Connection]
+) -> tuple[dict[str, Connection], list[str]]:
+    """Topics in the order of the metadata, and sentences on those with fewer messages than it says.
 
     Raises:
-        ReaderError: if the file has lost its end, or the checksum of the summary is wrong.
-        Exception: of any kind, if it is damaged and has no checksum.
+        ReaderError: where metadata and files do not have the same topics.
     """
-    name, found = Path(file.name).name, Summary()
-    end = file.seek(0, os.SEEK_END) - len(MCAP0_MAGIC) - 4
-    if end < 16:
-        raise ReaderError(f"{name} has no end")
-    file.seek(end - 16)
-    start, _, checksum = unpack("<QQI", file.read(20))
-    file.seek(min(start, end))
-    summary = file.read()
-    if checksum and crc32(summary[: -len(MCAP0_MAGIC) - 4]) != checksum:
-        raise ReaderError(f"the summary of {name} is not what was written")
-    if start:
-        for record in StreamReader(BytesIO(summary), skip_magic=True).records:
-            if isinstance(record, Channel):
-                found.channels[record.id] = record
-            elif isinstance(record, ChunkIndex):
-                found.chunk_indexes.append(record)
-    return found
-
-
-def _of_mcap(
-    file: BinaryIO,
-    known: Summary,
-    complain: Callable[[str], object],
-    only: str | None,
-    *,
-    has_index: bool,
-) -> Iterator[Stored]:
-    """Messages in the order of the file; schemas and channels are added to ``known``."""
-    file.seek(0)
-    if not MCAP0_MAGIC.startswith(file.read(len(MCAP0_MAGIC))):  # shorter: it was cut off
-        complain(f"{file.name} does not begin as an MCAP file")
-    is_indexed = has_index and bool(known.chunk_indexes)
-    for kind, start, end in _indexed(known, only) if is_indexed else _one_by_one(file):
-        records, is_right = _records_of(kind, file, start, end)
-        if not is_right:
-            complain(f"{file.name} is damaged between bytes {start} and {end}")
-        for record in records:
-            if isinstance(record, Schema):
-                known.schemas[record.id] = record
-            elif isinstance(record, Channel):
-                known.channels.setdefault(record.id, record)
-            elif isinstance(record, Message) and record.channel_id in known.channels:
-                topic, publish_ns = known.channels[record.channel_id].topic, record.publish_time
-                is_time = max(record.log_time, publish_ns) < 1 << 63
-                if is_time and only in (None, topic):
-                    yield Stored(topic, record.log_time, publish_ns, record.data, not is_right)
-
-
-def _indexed(summary: Summary, only: str | None) -> Iterator[tuple[int, int, int]]:
-    """Chunks that have the topic: kind of record, start and end in bytes."""
-    topics = {channel.id: channel.topic for channel in summary.channels.values()}
-    for index in summary.chunk_indexes:
-        # Without an index of its messages, a chunk may have any topic.
-        there = {topics.get(each) for each in index.message_index_offsets} or {only}
-        if only is None or only in there:
-            start = index.chunk_start_offset
-            yield Opcode.CHUNK, start, start + index.chunk_length
-
-
-def _one_by_one(file: BinaryIO) -> Iterator[tuple[int, int, int]]:
-    """Whole chunks, and records outside of chunks: kind, start and end in bytes."""
-    at, size = len(MCAP0_MAGIC), os.fstat(file.fileno()).st_size
-    while at + _RECORD_HEAD.size <= size:
-        file.seek(at)
-        kind, length = _RECORD_HEAD.unpack(file.read(_RECORD_HEAD.size))
-        end = at + _RECORD_HEAD.size + length
-        if end > size or kind == Opcode.DATA_END:
-            return
-        if kind in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
-            yield kind, at, end
-        at = end
-
-
-def _records_of(kind: int, file: BinaryIO, start: int, end: int) -> tuple[list[McapRecord], bool]:
-    """A record, or those of a chunk, and whether its checksum is right."""
-    try:
-        file.seek(start + _RECORD_HEAD.size)
-        size = min(end, os.fstat(file.fileno()).st_size) - file.tell()
-        stream = ReadDataStream(BytesIO(file.read(size)))
-        if kind == Opcode.MESSAGE:
-            return [Message.read(stream, size)], True
-        if kind != Opcode.CHUNK:
-            return [Schema.read(stream) if kind == Opcode.SCHEMA else Channel.read(stream)], True
-        chunk = Chunk.read(stream)
-        try:
-            return breakup_chunk(chunk, validate_crc=True), True
-        except CRCValidationError:
-            return breakup_chunk(chunk), False
-    except Exception:  # the library may raise anything for other bytes
-        return [], False
+    for name, each in found.items():
+        if each.msgcount and name not in metadata.topics:
+            raise ReaderError(
+                f"{METADATA_NAME} does not name the topic {name}, which its files have"
+            )
+    agreed, notes = {}, []
+    for name, (kind, count) in metadata.topics.items():
+        there = found.get(name)
+        if there is None or there.msgtype != kind:
+            if count:
+                raise ReaderError(f"its files do not have the topic {name} of type {kind}")
+            there = connection(0, name, kind, "cdr")
+        if there.msgcount < count and "run_id" in metadata.custom:
+            there = there._replace(msgcount=count)  # as many were written, so the others are lost
+        elif there.msgcount < count:
+            notes.append(
+                f"{METADATA_NAME} counts {count} packets of {name}, and the files have"
+                f" {there.msgcount}"
+            )
+        agreed[name] = there
+    return agreed, notes

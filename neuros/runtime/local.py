@@ -445,7 +445,7 @@ class LocalMiddleware:
         self._ros_nodes: dict[str, Any] = {}
         self._marks: dict[str, Callable[[RosProcess], None]] = {}
         self._transports: list[Transport] = []
-        self.loop: LocalLoop | RosLoop = loop or self._with_ros().loop
+        self.loop: LocalLoop | RosLoop = loop or self._with_ros().ros_loop
         self.packets = RosPackets()
         self.hub = MemoryHub(self.loop, self.packets.copier)
 
@@ -482,7 +482,7 @@ class LocalMiddleware:
         from neuros.transport.ros_graph import RosGraphBridge
 
         shown = file if self._exposes else replace(file, connections=())
-        return RosGraphBridge(shown, self._ros_node(file), self._with_ros().loop)
+        return RosGraphBridge(shown, self._ros_node(file), self._with_ros().ros_loop)
 
     def ros_node(self, file: NodeFile) -> Any:
         return self._ros_nodes[file.node.name]
@@ -557,7 +557,7 @@ class LocalMiddleware:
             os.environ.setdefault(RANGE_VARIABLE, "LOCALHOST")
             self._ros = RosProcess(self._files, self._on_failure, debug=self._debug)
             if self._local is not None:
-                self._local.serve(self._ros.loop)
+                self._local.serve(self._ros.ros_loop)
         return self._ros
 
 

@@ -29,7 +29,7 @@ from neuros.transport.memory import MemoryHub, MemoryLink, MemoryTransport
 
 _CONTROL, _ARRIVAL, _OWN, _SIMULATOR, _LOOP_BACK = range(5)
 """The events of a node at one instant, in this order."""
-_DRAIN_S = 5.0
+DRAIN_S = 5.0
 _FAR_NS = 1_000_000
 """How long the end of a run takes to a node that no connection leads to."""
 
@@ -78,6 +78,17 @@ class NodeTime:
     def add_timer(self, next_due_ns: Callable[[], int | None], on_due: Event) -> None:
         self._timers.append((next_due_ns, on_due))
 
+    def announce(self, duration_ns: int) -> None:
+        """A hook starts that takes at least so long: who waits for the node may go on."""
+
+    def ready(self) -> None:
+        """The initialise hooks have run, but for those that wait for packets."""
+
+    def at_zero(self, event: Event, first_pass: Event) -> None:
+        """Handle an event when time 0 of the run has come, which is now; then let hooks start."""
+        event()
+        self.post(first_pass)
+
     def hold(self, duration_ns: int) -> None:
         """A hook that started now takes so long."""
         self.now_ns += duration_ns
@@ -103,7 +114,7 @@ class NodeTime:
         """The node asks for the end of the run, at its own time."""
         self._loop.end(self._name, drain_s)
 
-    def drain(self, event: Event, stop: Event) -> None:
+    def drain(self, event: Event, stop: Event, *, is_asked: bool) -> None:
         """Handle an event when the end of the run reaches the node, before everything else."""
         self._add(max(self._loop.drain(self._name, stop), self.now_ns), _CONTROL, event)
 
@@ -196,9 +207,12 @@ class VirtualLoop(LocalLoop):
     def of(self, name: str) -> NodeTime:
         """The clock and the events of a node; the first call tells its place among all nodes."""
         if name not in self._by_name:
-            self._by_name[name] = NodeTime(self, name, len(self._nodes))
+            self._by_name[name] = self._make_node(name, len(self._nodes))
             self._nodes.append(self._by_name[name])
         return self._by_name[name]
+
+    def _make_node(self, name: str, place: int) -> NodeTime:
+        return NodeTime(self, name, place)
 
     def queue(self, node: NodeTime, place: int) -> None:
         """A node has a new event, or has handled one."""
@@ -263,7 +277,7 @@ class VirtualLoop(LocalLoop):
     def drain(self, name: str, stop: Event) -> int:
         """When a node begins to drain; ``stop`` is called if the run has not drained in time."""
         if self._end is None:
-            self.end("", _DRAIN_S)
+            self.end("", DRAIN_S)
         assert self._end is not None
         end_ns, stopped, drain_ns = self._end
         self.waits_for_rest = True
@@ -294,9 +308,11 @@ class VirtualLoop(LocalLoop):
         node = self._next_node()
         if node is None or node.queued_ns is None:
             return False
-        time_ns = node.queued_ns
-        if self.limit_ns is not None and time_ns >= self.limit_ns:
-            return self._come_to_limit(self.limit_ns)
+        time_ns, limit_ns = node.queued_ns, self.limit_ns
+        if not self._may_handle(time_ns if limit_ns is None else min(time_ns, limit_ns)):
+            return False
+        if limit_ns is not None and time_ns >= limit_ns:
+            return self._come_to_limit(limit_ns)
         if self._calls and not self.waits_for_rest and time_ns >= self.zero_ns + self._calls[0][0]:
             self._calls.pop(0)[1]()
             return True
@@ -342,6 +358,10 @@ class VirtualLoop(LocalLoop):
             self._events.append(self._from_threads.get(timeout=seconds))
         except queue.Empty:
             return
+
+    def _may_handle(self, time_ns: int) -> bool:
+        """Whether nothing can arrive any more before the events of a time."""
+        return True
 
     def _come_to_limit(self, limit_ns: int) -> bool:
         """Do what is to be done at the limit, once; returns whether there was anything."""
@@ -405,18 +425,40 @@ def reach_ns(connections: Iterable[Connection], start: str) -> dict[str, int]:
     return found
 
 
+class Direction:
+    """One direction of a connection: when its packets, or its acknowledgements, arrive.
+
+    Args:
+        what: ``"delay"``, that of packets, or ``"acknowledgement"``.
+    """
+
+    __slots__ = ("_arrival_ns", "_delay", "_delays", "_loss", "_losses", "_number")
+
+    def __init__(self, seed: str, what: str, connection: Connection) -> None:
+        self._delay = connection.delay
+        self._loss = connection.loss if what == "delay" else 0.0
+        self._delays = Draws(seed, what, str(connection))
+        self._losses = Draws(seed, "loss", str(connection))
+        self._number = self._arrival_ns = 0
+
+    def send(self, now_ns: int) -> tuple[int, int] | None:
+        """The time of arrival of the next one, and its number; ``None``: it is lost.
+
+        None overtakes another.
+        """
+        number = self._number = self._number + 1
+        if self._loss and self._losses.share(number) < self._loss:
+            return None
+        share = 0.5 if self._delay.kind == "constant" else self._delays.share(number)
+        delay_ns = max(LEAST_DELAY_NS, self._delay.at_ns(share))
+        self._arrival_ns = max(self._arrival_ns, now_ns + delay_ns)
+        return self._arrival_ns, number
+
+
 class VirtualLink(MemoryLink):
     """One connection: each packet, and each acknowledgement, is under way for its delay."""
 
-    __slots__ = (
-        "_back_ns",
-        "_delays",
-        "_destination",
-        "_losses",
-        "_numbers",
-        "_source",
-        "_there_ns",
-    )
+    __slots__ = ("_back", "_destination", "_source", "_there")
 
     def __init__(self, hub: VirtualHub, connection: Connection) -> None:
         super().__init__(hub, connection)
@@ -426,40 +468,28 @@ class VirtualLink(MemoryLink):
 
     def begin_anew(self, seed: str) -> None:
         """The first packet, and the first acknowledgement, come next."""
-        name = str(self.connection)
-        self._delays = [Draws(seed, way, name) for way in ("delay", "acknowledgement")]
-        self._losses = Draws(seed, "loss", name)
-        self._numbers = [0, 0]
-        self._there_ns = self._back_ns = 0
+        self._there = Direction(seed, "delay", self.connection)
+        self._back = Direction(seed, "acknowledgement", self.connection)
 
     def send(self, packet: Any, digest: int | None) -> None:
-        delay_ns, number = self._under_way(0)
-        loss = self.connection.loss
-        if loss and self._losses.share(number) < loss:
-            return
-        # Packets of a connection never overtake each other.
-        self._there_ns = max(self._there_ns, self._source.now_ns + delay_ns)
-        arrive = partial(self._arrive, packet, digest)
-        self._destination.arrive(self._there_ns, self.connection.index, number, arrive)
+        way = self._there.send(self._source.now_ns)
+        if way is not None:
+            arrive = partial(self._arrive, packet, digest)
+            self._destination.arrive(way[0], self.connection.index, way[1], arrive)
 
     def acknowledge(self, position: int) -> None:
-        delay_ns, number = self._under_way(1)
-        self._back_ns = max(self._back_ns, self._destination.now_ns + delay_ns)
-        inbox = self._hub.inboxes[self.connection.source_node]
+        if not self._destination_end.is_open:
+            return
+        way = self._back.send(self._destination.now_ns)
+        assert way is not None  # no acknowledgement is lost
+        inbox = self._source_end.inbox
         arrive = partial(inbox.on_acknowledgement, self.connection, position)
-        self._source.arrive(self._back_ns, self.connection.index, number, arrive)
-
-    def _under_way(self, way: int) -> tuple[int, int]:
-        """The delay of the next packet (0) or acknowledgement (1), and its number."""
-        number = self._numbers[way] = self._numbers[way] + 1
-        delay = self.connection.delay
-        share = 0.5 if delay.kind == "constant" else self._delays[way].share(number)
-        return max(LEAST_DELAY_NS, delay.at_ns(share)), number
+        self._source.arrive(way[0], self.connection.index, way[1], arrive)
 
     def _arrive(self, packet: Any, digest: int | None) -> None:
         if digest is not None:
             self.received.append(digest)
-        self._hub.inboxes[self.connection.destination_node].on_packet(self.connection, packet)
+        self._destination_end.inbox.on_packet(self.connection, packet)
 
 
 class VirtualHub(MemoryHub):
@@ -478,7 +508,7 @@ class VirtualHub(MemoryHub):
 
     def _register(self, connection: Connection) -> None:
         source = connection.source_node
-        event = partial(self.inboxes[source].on_registered, connection)
+        event = partial(self.ends[source].inbox.on_registered, connection)
         self.virtual.of(source).post(event)
 
 

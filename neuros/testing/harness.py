@@ -21,7 +21,7 @@ from neuros.control import Message, Shutdown
 from neuros.distribution import WORKSPACE
 from neuros.engine.engine import Engine
 from neuros.engine.send_window import SendWindow
-from neuros.engine.snapshot import snapshot
+from neuros.engine.snapshot import explain, snapshot
 from neuros.errors import NeurosError, NodeError, ProjectError
 from neuros.installation.progress import Progress
 from neuros.messages.needed import Messages
@@ -91,7 +91,7 @@ class Neighbours:
         if position > started:
             self._started[connection] = position
             if connection.is_reliable:
-                node = self._hub.inboxes[connection.source_node]
+                node = self._hub.ends[connection.source_node].inbox
                 self._hub.loop.post(partial(node.on_acknowledgement, connection, position))
 
     # ------------------------------------------------------------------ inbox
@@ -117,7 +117,7 @@ class Neighbours:
         window, waiting = self._windows[connection], self._waiting[connection]
         while waiting and not window.is_blocked:
             window.spend(0)
-            node = self._hub.inboxes[connection.destination_node]
+            node = self._hub.ends[connection.destination_node].inbox
             self._hub.loop.post(partial(node.on_packet, connection, waiting.popleft()))
 
 
@@ -175,6 +175,7 @@ class PluginHarness:
     Attributes:
         log: the records of the node; Python's ``logging`` has them, too (``neuros.<name>``).
         shutdown_reason: the argument of the plugin's ``node.shutdown``, ``None`` before.
+        file: the node, with its connections.
 
     Args:
         plugin: the plugin file, the name of an installed module, or functions with a decorator of
@@ -319,7 +320,7 @@ class PluginHarness:
         file = NodeFile(node, connections, folders, messages=messages, restored=restored)
         self.log: list[Record] = []
         self.shutdown_reason: str | None = None
-        self._file = file
+        self.file = file
         self._failure: NeurosError | None = None
         self._is_final = False
         self._clock = ManualClock()
@@ -447,7 +448,7 @@ class PluginHarness:
 
     def explain(self) -> list[str]:
         """Why nothing moves, in the words of the stall explainer."""
-        return self._runtime.reports.explain()
+        return explain(self._engine, self._clock())
 
     # ------------------------------------------------------------------ what goes in
 
@@ -487,16 +488,17 @@ class PluginHarness:
 
     # ------------------------------------------------------------------ what comes out
 
-    def received(self, output: str, receiver: str | None = None) -> list[Any]:
+    def received(self, output: str, receiver: str | None = None, start: int = 0) -> list[Any]:
         """The packets of an output so far, oldest first.
 
         Args:
             receiver: ``"viewer"`` or ``"viewer.image"``; all receivers get the same packets.
+            start: how many of the oldest to leave out.
         """
         port = self._port(output, "output", self._outputs)
         if port.external_topic is not None:
-            return list(self._topics.published.get(output, ()))
-        return list(self._ends.received[self._to(output, receiver)[0]])
+            return list(self._topics.published.get(output, ()))[start:]
+        return self._ends.received[self._to(output, receiver)[0]][start:]
 
     def block(self, output: str, receiver: str | None = None) -> None:
         """Make receivers of an output busy: they start on no further packet."""
@@ -538,7 +540,7 @@ class PluginHarness:
     def _in_context(self) -> Iterator[None]:
         """Switch to the context of the node, and back to that of the test."""
         folder = os.getcwd()
-        os.chdir(self._file.folders.run)
+        os.chdir(self.file.folders.run)
         try:
             yield
         finally:
@@ -547,16 +549,16 @@ class PluginHarness:
 
     @property
     def _inputs(self) -> dict[str, Port]:
-        return {port.name: port for port in self._file.node.inputs}
+        return {port.name: port for port in self.file.node.inputs}
 
     @property
     def _outputs(self) -> dict[str, Port]:
-        return {port.name: port for port in self._file.node.outputs}
+        return {port.name: port for port in self.file.node.outputs}
 
     def _port(self, name: str, side: str, known: Mapping[str, Port]) -> Port:
         if name not in known:
             has = ", ".join(known) or "none"
-            raise ValueError(f"node '{self._file.node.name}' has no {side} '{name}' (it has {has})")
+            raise ValueError(f"node '{self.file.node.name}' has no {side} '{name}' (it has {has})")
         return known[name]
 
     def _from(self, input_name: str, source: str | None) -> list[Connection]:

@@ -112,7 +112,17 @@ class LeanNode(RosNode):  # type: ignore[misc]
         self, timer_period_sec: float, callback: Any, *rest: Any, **keywords: Any
     ) -> Any:
         """As in rclpy."""
-        return super().create_timer(timer_period_sec, self._new(callback), *rest, **keywords)
+        timer = super().create_timer(timer_period_sec, self._new(callback), *rest, **keywords)
+        if self.callbacks is not None:
+            self.callbacks.loop.add_ros_timer(timer)
+        return timer
+
+    def destroy_timer(self, timer: Any) -> bool:
+        """As in rclpy."""
+        if self.callbacks is not None:
+            self.callbacks.loop.remove_ros_timer(timer)
+        is_destroyed: bool = super().destroy_timer(timer)
+        return is_destroyed
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Any, **keywords: Any) -> Any:
         """As in rclpy; a service does not answer after a failure of its node."""

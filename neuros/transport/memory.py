@@ -37,7 +37,7 @@ class MemoryHub:
             share nothing with the packet.
 
     Attributes:
-        arrivals: what is on its way to each node.
+        ends: the end of each node, by name; also of those that have not joined.
     """
 
     def __init__(
@@ -47,8 +47,7 @@ class MemoryHub:
     ) -> None:
         self.loop = loop
         self.copier = copier
-        self.arrivals: dict[str, _Arrivals] = defaultdict(_Arrivals)
-        self.inboxes: dict[str, Inbox] = {}
+        self.ends: dict[str, _End] = defaultdict(_End)
         self._links: dict[Connection, MemoryLink] = {}
         self._waiting: list[Connection] = []
 
@@ -60,20 +59,23 @@ class MemoryHub:
 
     def join(self, name: str, inbox: Inbox, connections: Sequence[Connection]) -> None:
         """Add a node, and tell the senders that waited for it."""
-        self.inboxes[name] = inbox
+        self.ends[name].inbox = inbox
         self._waiting += [c for c in connections if c.source_node == name]
         for connection in tuple(self._waiting):
-            if connection.destination_node in self.inboxes:
+            if self.ends[connection.destination_node].inbox is not None:
                 self._waiting.remove(connection)
                 self._register(connection)
 
     def leave(self, name: str) -> None:
-        """Let what is under way to a node go nowhere."""
-        if name in self.inboxes:
-            self.inboxes[name] = _Nobody()
+        """Let what is under way to a node go nowhere, and let nothing leave it."""
+        end = self.ends[name]
+        end.is_open = False
+        if end.inbox is not None:
+            end.inbox = _Nobody()
 
     def _register(self, connection: Connection) -> None:
-        self.loop.post(lambda: self.inboxes[connection.source_node].on_registered(connection))
+        end = self.ends[connection.source_node]
+        self.loop.post(lambda: end.inbox.on_registered(connection))
 
 
 class MemoryTransport:
@@ -94,11 +96,10 @@ class MemoryTransport:
     ) -> None:
         self._node, self._name = file.node, file.node.name
         self._loop = hub.loop
-        self._arrivals = hub.arrivals[file.node.name]
+        self._end = hub.ends[file.node.name]
         self._connections = file.connections
         self._hub = hub
         self._bridge = bridge
-        self._is_open = False
         self._is_turn_of_others = False
         self._digest = digest
         self.compressed: dict[str, tuple[int, int]] = {}  # nothing leaves the machine
@@ -111,7 +112,7 @@ class MemoryTransport:
 
     def open(self, inbox: Inbox) -> None:
         """Join the others."""
-        self._is_open = True
+        self._end.is_open = True
         self._bridge.open(inbox)
         self._hub.join(self._name, inbox, self._connections)
 
@@ -122,10 +123,10 @@ class MemoryTransport:
         links = [self._hub.link(c) for c in connections]
         digested = [link for link in links if link.connection in self.digests]
         copy = self._hub.copier(self._node.output(connections[0].source_output).type)
-        bridge = self._bridge
+        bridge, end = self._bridge, self._end
 
         def send(packet: Any) -> None:
-            if not self._is_open:
+            if not end.is_open:
                 return
             digest = self._add_digest(digested, packet) if digested else None
             for link in links:
@@ -147,7 +148,7 @@ class MemoryTransport:
         bridge = self._bridge
 
         def send(packet: Any) -> None:
-            if not self._is_open:
+            if not self._end.is_open:
                 return
             for link, codec in links:
                 data, digest = codec.encode(packet), None
@@ -167,17 +168,11 @@ class MemoryTransport:
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
         """Return what tells the sender which position every hook has reached."""
-        acknowledge = self._hub.link(connection).acknowledge
-
-        def acknowledge_if_open(position: int) -> None:
-            if self._is_open:
-                acknowledge(position)
-
-        return acknowledge_if_open
+        return self._hub.link(connection).acknowledge
 
     def note_execution(self) -> None:
         """A hook has ended: what is on its way here comes before the next one."""
-        self._arrivals.first = self._arrivals.sent
+        self._end.first = self._end.sent
         self._loop.note_execution()
 
     def give_way(self) -> None:
@@ -191,26 +186,25 @@ class MemoryTransport:
 
     def has_taken_in(self) -> bool:
         return (
-            self._arrivals.arrived >= self._arrivals.first
+            self._end.arrived >= self._end.first
             and not self._is_turn_of_others
             and self._loop.has_taken_in
         )
 
     def _end_turn_of_others(self) -> None:
         self._is_turn_of_others = False
-        self._arrivals.first = self._arrivals.sent
+        self._end.first = self._end.sent
 
     def waiting_for(self) -> Sequence[Connection]:
-        joined = self._hub.inboxes
+        ends = self._hub.ends
         return [
             c
             for c in self._connections
-            if c.source_node not in joined or c.destination_node not in joined
+            if ends[c.source_node].inbox is None or ends[c.destination_node].inbox is None
         ]
 
     def close(self) -> None:
         """Send and receive nothing any more."""
-        self._is_open = False
         self._hub.leave(self._name)
         self._bridge.close()
 
@@ -229,18 +223,22 @@ class MemoryTransport:
         return digest
 
 
-class _Arrivals:
-    """The packets and acknowledgements for one node, each of them an event in the loop.
+class _End:
+    """One node, and the packets and acknowledgements for it: each is an event in the loop.
 
     Attributes:
+        inbox: the node; ``None``: it has not joined.
+        is_open: whether it may send.
         sent: how many have been sent so far, but for packets that were lost in transport.
         arrived: how many of them have arrived.
         first: how many come before the next hook.
     """
 
-    __slots__ = ("arrived", "first", "sent")
+    __slots__ = ("arrived", "first", "inbox", "is_open", "sent")
 
     def __init__(self) -> None:
+        self.inbox: Any = None
+        self.is_open = False
         self.sent = self.arrived = self.first = 0
 
 
@@ -265,11 +263,11 @@ class MemoryLink:
     """
 
     __slots__ = (
-        "_arrivals",
-        "_arrivals_back",
-        "_hub",
+        "_destination_end",
+        "_loop",
         "_packets",
         "_positions",
+        "_source_end",
         "_window",
         "connection",
         "received",
@@ -277,27 +275,28 @@ class MemoryLink:
     )
 
     def __init__(self, hub: MemoryHub, connection: Connection) -> None:
-        self._hub = hub
+        self._loop = hub.loop
         self.connection = connection
         self._window = connection.window
         self._packets: deque[tuple[Any, int | None]] = deque(maxlen=self._window)
         self._positions: deque[int] = deque()
-        self._arrivals = hub.arrivals[connection.destination_node]
-        self._arrivals_back = hub.arrivals[connection.source_node]
+        self._destination_end = hub.ends[connection.destination_node]
+        self._source_end = hub.ends[connection.source_node]
         self.sent, self.received = array("Q"), array("Q")
 
     def send(self, packet: Any, digest: int | None) -> None:
         """Put a packet on its way, with its digest if that is kept."""
         if len(self._packets) < self._window:  # else an event is on its way for one that is lost
-            self._arrivals.sent += 1
-            self._hub.loop.post(self._receive)
+            self._destination_end.sent += 1
+            self._loop.post(self._receive)
         self._packets.append((packet, digest))
 
     def acknowledge(self, position: int) -> None:
         """Put the acknowledgement of a position on its way back."""
-        self._arrivals_back.sent += 1
-        self._positions.append(position)
-        self._hub.loop.post(self._receive_position)
+        if self._destination_end.is_open:
+            self._source_end.sent += 1
+            self._positions.append(position)
+            self._loop.post(self._receive_position)
 
     def forget_digests(self) -> None:
         """Keep none of the packets so far, nor of those on their way."""
@@ -310,12 +309,11 @@ class MemoryLink:
         packet, digest = self._packets.popleft()
         if digest is not None:
             self.received.append(digest)
-        self._arrivals.arrived += 1
-        connection = self.connection
-        self._hub.inboxes[connection.destination_node].on_packet(connection, packet)
+        end = self._destination_end
+        end.arrived += 1
+        end.inbox.on_packet(self.connection, packet)
 
     def _receive_position(self) -> None:
-        self._arrivals_back.arrived += 1
-        connection = self.connection
-        inbox = self._hub.inboxes[connection.source_node]
-        inbox.on_acknowledgement(connection, self._positions.popleft())
+        end = self._source_end
+        end.arrived += 1
+        end.inbox.on_acknowledgement(self.connection, self._positions.popleft())

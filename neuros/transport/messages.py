@@ -149,7 +149,7 @@ def encode_packet(packet: Any) -> bytes:
 class RosPackets:
     """What NeuROS does with packets (:class:`neuros.ports.Packets`)."""
 
-    make = staticmethod(make_packet)
+    maker = staticmethod(factory_of)
     encode = staticmethod(encode_packet)
     copier = staticmethod(copier_of)
 

@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import rclpy.task
@@ -26,21 +27,13 @@ OnFailure: TypeAlias = Callable[[BaseException], None]
 # process by SIGSEGV: https://github.com/ros2/rclpy/issues/1641, corrected by its pull request 1718.
 
 
-class Turn:
+class Turn(partial[None]):
     """A callback that can stand in the queue of an executor again and again.
 
     ``create_task`` of rclpy makes a task for each call, an object with two locks and a weak
     reference, for 4 of the 6.5 us that a turn in the queue takes. This one takes the place of such
     a task itself, and has always been done. Where rclpy wraps it after all, that works, too.
     """
-
-    __slots__ = ("_callback",)
-
-    def __init__(self, callback: Callable[[], None]) -> None:
-        self._callback = callback
-
-    def __call__(self) -> None:
-        self._callback()
 
     def done(self) -> bool:
         """The queue may forget it."""

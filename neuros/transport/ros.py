@@ -253,15 +253,16 @@ class RosTransport:
         elif connection.is_zstd:
             self._compressors.setdefault(connection.source_output, Compressor())
         data = self._ros_node.create_publisher(
-            kind, f"{connection.topic}/data", data_qos(connection)
+            kind, f"{connection.topic}/data", self._data_qos(connection)
         )
-        link = self._sending[connection] = SendingLink(
+        link = self._sending[connection] = self._make_sending_link(
             connection, inbox, codec, digest, self.digests[connection], data
         )
         subscriptions = []
         if connection.is_reliable:
+            qos = self._position_qos(is_reader=True)
             subscriptions.append(
-                self._subscribe(UInt64, connection, "ack", _LATCHED_READER, link.receive_position)
+                self._subscribe(UInt64, connection, "ack", qos, link.receive_position)
             )
         self._registrations.append(
             Registration(
@@ -282,10 +283,11 @@ class RosTransport:
         kind, codec, digest = _way(connection, port, Traffic())
         publishers = []
         if connection.is_reliable:
+            qos = self._position_qos(is_reader=False)
             publishers.append(
-                self._ros_node.create_publisher(UInt64, f"{connection.topic}/ack", _LATCHED)
+                self._ros_node.create_publisher(UInt64, f"{connection.topic}/ack", qos)
             )
-        link = self._receiving[connection] = ReceivingLink(
+        link = self._receiving[connection] = self._make_receiving_link(
             connection,
             inbox,
             codec if connection.is_jpeg else self._large.decoder(connection),
@@ -295,7 +297,7 @@ class RosTransport:
         )
         receive = decompressing(link.receive) if connection.is_zstd else link.receive
         data = self._subscribe(
-            kind, connection, "data", data_qos(connection, is_reader=True), receive
+            kind, connection, "data", self._data_qos(connection, is_reader=True), receive
         )
         self._registrations.append(
             Registration(
@@ -310,11 +312,23 @@ class RosTransport:
             )
         )
 
+    # What differs in virtual time (:mod:`neuros.runtime.virtual_ros`).
+    _make_sending_link: Callable[..., SendingLink] = SendingLink
+    _make_receiving_link: Callable[..., ReceivingLink] = ReceivingLink
+    _data_qos = staticmethod(data_qos)
+
+    def _position_qos(self, *, is_reader: bool) -> QoSProfile:
+        return _LATCHED_READER if is_reader else _LATCHED
+
     def _on_receiver_found(self, connection: Connection, note: str, inbox: Inbox) -> None:
-        """Choose the codec for a receiver that has sent ``note`` with its registration."""
+        """A receiver is there, and has sent ``note`` with its registration."""
+        self._prepare(connection, note)
+        inbox.on_registered(connection)
+
+    def _prepare(self, connection: Connection, note: str) -> None:
+        """Choose the codec for the receiver."""
         link = self._sending[connection]
         if connection.is_jpeg:
-            inbox.on_registered(connection)
             return
         link.codec = self._large.encoder(connection, note, link.count_readers) or link.codec
         if connection.is_zstd and (not note or note != machine_token()):
@@ -324,7 +338,6 @@ class RosTransport:
                 link.count_readers,
                 link.publish,
             )
-        inbox.on_registered(connection)
 
     def _subscribe(
         self,

@@ -27,6 +27,7 @@ from typing import Any
 
 from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
 from rclpy.node import Node as RosNode
 from rclpy.timer import Timer
 
@@ -88,6 +89,7 @@ class RosLoop:
         self.has_taken_in = True
         self._has_arrivals = False
         self.turns = 0
+        self._ros_timers: list[Timer] = []
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self._planned_ns: int | None = None
         self._has_older_events = False
@@ -121,13 +123,40 @@ class RosLoop:
 
         Callbacks that are taken in then put that off no further, however many keep coming.
         """
+        if self._ros_timers:
+            self._call_due_ros_timers()
         if not (self._has_arrivals and self.has_taken_in):
             return
         self.has_taken_in = False
         if self._has_posted_turn:
             self._is_turn_stale = True
         else:
-            self._post_turn()
+            self._has_posted_turn = True
+            self._executor.create_task(self._turn)
+
+    def add_ros_timer(self, timer: Timer) -> None:
+        """Call back a timer of a plugin after the hook during which it becomes due.
+
+        The executor puts an event behind all that wait when the timer becomes due, and the callback
+        behind all that wait then. With a hook before each, the timer would miss its next time.
+        """
+        if self.is_limited:  # a wait set has timers before all else
+            self._ros_timers.append(timer)
+
+    def remove_ros_timer(self, timer: Timer) -> None:
+        """The timer is going to be destroyed."""
+        if timer in self._ros_timers:
+            self._ros_timers.remove(timer)
+
+    def _call_due_ros_timers(self) -> None:
+        """Queue callbacks of timers that are due, before the turn in which the next hook starts."""
+        for timer in [*self._ros_timers]:
+            try:
+                if timer.is_ready():
+                    timer.handle.call_timer()
+                    self._executor.create_task(timer.callback)
+            except InvalidHandle:  # the plugin has destroyed it
+                self._ros_timers.remove(timer)
 
     @property
     def has_waiting_events(self) -> bool:

@@ -23,7 +23,7 @@ from rclpy.qos import (
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
 
-from neuros.ports import NodeEvents, Transport, TransportKind
+from neuros.ports import EventLoop, NodeEvents, Transport, TransportKind
 from neuros.project.model import NodeFile
 from neuros.project.names import INTERNAL
 from neuros.transport.dds_profile import dds_environment
@@ -83,7 +83,8 @@ class RosProcess:
             context=self._context,
             signal_handler_options=SignalHandlerOptions.NO,
         )
-        self.loop = RosLoop(self._context, on_failure)
+        self.ros_loop = RosLoop(self._context, on_failure)
+        self.loop: EventLoop = self.ros_loop
         self.packets = RosPackets()
         self._ros_nodes: dict[str, LeanNode] = {}
         self._own_entities: dict[str, set[int]] = {}
@@ -91,7 +92,7 @@ class RosProcess:
         self._transports: list[Transport] = []
 
     def transport(self, file: NodeFile) -> Transport:
-        transport = RosTransport(file, self.ros_node(file), self.loop)
+        transport = RosTransport(file, self.ros_node(file), self.ros_loop)
         self._transports.append(transport)
         return transport
 
@@ -100,7 +101,7 @@ class RosProcess:
         name = file.node.name
         if name not in self._ros_nodes:
             self._ros_nodes[name] = lean_node(file, self._context)
-            self.loop.add_node(self._ros_nodes[name])
+            self.ros_loop.add_node(self._ros_nodes[name])
         return self._ros_nodes[name]
 
     def loop_of(self, file: NodeFile) -> NodeEvents:
@@ -128,7 +129,7 @@ class RosProcess:
         """
         ros_node = self.ros_node(file)
         self._own_entities[file.node.name] = entities(ros_node)
-        self._callbacks.append(PluginCallbacks(ros_node, self.loop, enter, fail, thread))
+        self._callbacks.append(PluginCallbacks(ros_node, self.ros_loop, enter, fail, thread))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
         own = self._own_entities.get(file.node.name, set())
@@ -146,13 +147,13 @@ class RosProcess:
     def take_in(self) -> None:
         """Handle what had arrived when the loop ended, but for callbacks of plugins."""
         self._close_callbacks()
-        self.loop.take_in()
+        self.ros_loop.take_in()
 
     def flush(self) -> None:
         """Send and receive nothing any more, and let what was sent last leave."""
         for transport in self._transports:
             transport.close()
-        self.loop.run_for(_LINGER_S)
+        self.ros_loop.run_for(_LINGER_S)
 
     def close(self, *, may_stay: bool = True) -> None:
         """Close the loop and ROS. In a crowd, ROS may stay open until the process ends.
@@ -161,7 +162,7 @@ class RosProcess:
         killed; the shared memory of DDS is left to the reaper.
         """
         self._close_callbacks()
-        self.loop.close()
+        self.ros_loop.close()
         others: set[str] = set()
         for ros_node in [*self._ros_nodes.values()][:1]:  # each lists the whole domain
             others = {*ros_node.get_node_names()} - {*self._ros_nodes}

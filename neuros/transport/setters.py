@@ -27,6 +27,7 @@ from neuros.transport.values import (
     to_numbers,
 )
 
+_MEMORY = (bytes, bytearray)  # each use of a union would create it anew
 _Put = Callable[[Any, Any], None]
 
 
@@ -90,8 +91,8 @@ def _to_sequence(field: Field) -> Convert:
     code, convert_other = field.type.code, converter(field)
 
     def convert(value: Any) -> Any:
-        is_memory = isinstance(value, bytes | bytearray)
-        if is_memory or (type(value) is array and value.typecode == code):
+        is_same = type(value) is array and value.typecode == code
+        if is_same or isinstance(value, _MEMORY):
             return array(code, value)
         if isinstance(value, Iterable) and not (
             isinstance(value, str) or hasattr(type(value), "__array__")

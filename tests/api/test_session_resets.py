@@ -23,13 +23,13 @@ from neuros.api.session import Session
 from neuros.backends.control_sockets import connect
 from neuros.control import (
     TO_OBSERVERS,
-    LookAll,
+    GetStatus,
     Message,
     NodeStatus,
     Pause,
     Reset,
     Resume,
-    StepAll,
+    Step,
     WasReset,
     Watch,
 )
@@ -264,7 +264,7 @@ def answer(link: ControlLink, *wishes: Message) -> WasReset:
 
 def counted(link: ControlLink) -> tuple[str, int]:
     """The state of the thrower, and how many dice it has thrown."""
-    link.send(LookAll({}))
+    link.send(GetStatus({}))
     while True:
         for message in link.receive() or ():
             if isinstance(message, NodeStatus) and message.node == "thrower":
@@ -282,7 +282,7 @@ def test_an_observer_resets_a_run_only_while_that_is_paused(tmp_path: Path) -> N
         while counted(link)[1] == 0:
             pass
         assert answer(link, Reset({})).why_not == "the run is not paused: pause it first"
-        assert answer(link, Pause(), StepAll(1_000_000), Reset({})).why_not == ""
+        assert answer(link, Pause(), Step(1_000_000), Reset({})).why_not == ""
         wait_until(lambda: counted(link)[0] == "paused")  # it registers, and initialises, first
         assert counted(link) == ("paused", 0)
         link.send(Resume())

@@ -209,7 +209,7 @@ class TestRuns:
         project.container("robot", "jsonschema")
         pythons = project.pythons(c="robot")
         assert not (project.folder / "cache").exists()
-        pythons.note_use()
+        pythons.record_use()
         assert len(list((project.folder / "cache/neuros/environments").iterdir())) == 1
 
     def test_what_is_wrong_in_all_containers_is_said_at_once(self, project: Project) -> None:

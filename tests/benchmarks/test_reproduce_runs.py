@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import csv
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from benchmarks.reproduce import voting
+from benchmarks.machine import ROOT
+from benchmarks.reproduce import orchestrations, voting
 from benchmarks.reproduce.experiment import Entry
 from benchmarks.reproduce.whiskeye import PARTS
+from neuros.api.run_record import open_run
 from neuros.cli.main import main
 
 
@@ -114,3 +119,30 @@ def test_a_network_is_trained_and_its_weights_correct_the_ring(tmp_path: Path) -
     page = (tmp_path / "index.md").read_text()
     assert "figures/correction_error.png" in page
     assert "Some runs here were shorter" in page
+
+
+def test_an_orchestration_in_virtual_time_has_a_digest_that_its_command_repeats(
+    tmp_path: Path,
+) -> None:
+    parts = ("strict.60ms", "no_discard_limit.60ms")
+    command = ["reproduce", "orchestrations", "--duration", "2", "--backend", "in-process"]
+    assert main([*command, "--only", *parts, "-o", str(tmp_path / "first")]) == 0
+    strict, free = rows(tmp_path / "first").values()
+    assert float(strict["loss_percent"]) == 0
+    assert float(free["loss_percent"]) > 50
+    assert float(strict["rms_deg"]) < 6 < float(free["rms_deg"]), "a lost packet is lost angle"
+    assert float(strict["speed_percent"]) == pytest.approx(100 / 3, rel=0.05)
+    assert float(free["speed_percent"]) == pytest.approx(100, rel=0.01)
+    for picture in ("orchestrations", "orchestrations_computing"):
+        assert (tmp_path / f"first/figures/{picture}.png").stat().st_size > 10_000
+
+    program, *words = shlex.split(free["command"])
+    assert program == "neuros"
+    again = subprocess.run(
+        [sys.executable, "-m", "neuros.cli", *words, "-o", str(tmp_path / "again")],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert again.returncode == 0, again.stderr
+    assert orchestrations.digest_of(open_run(tmp_path / "again")) == free["digest"]

@@ -76,7 +76,7 @@ def test_launching_spares_the_restart_that_the_ros_wheels_would_make(tmp_path: P
         ("neuros launch --backend in", {"in-process"}),
         ("neuros launch --viewer r", {"rerun", "rqt_graph", "rviz2"}),
         ("neuros stop --", {"--help", "--all"}),
-        ("./launch.py --no-", {"--no-placement", "--no-progress", "--no-ros"}),
+        ("./launch.py --no-", {"--no-placement", "--no-portable", "--no-progress", "--no-ros"}),
     ],
 )
 def test_a_shell_that_completes_a_line_is_answered(

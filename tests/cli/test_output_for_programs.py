@@ -90,7 +90,8 @@ def test_verify_has_its_verdict(said: Any, tmp_path: Path) -> None:
     found, code = said("verify", a, b)
     assert (found["verdict"], code) == ("unknown", 2)
     assert found.keys() == {
-        *("verdict", "packets", "difference", "consumed_differently", "not_compared", "notes")
+        *("verdict", "packets", "difference", "consumed_differently", "not_compared"),
+        *("likely_cause", "notes"),
     }
     assert found["not_compared"] == [WIRE]
 

@@ -1,7 +1,7 @@
 """The plugin of every node of a conformance run: its hooks are described in its environment.
 
 Each execution is one line of ``observed.jsonl`` in the node's run folder: what the hook took, what
-it sent, and when it started and ended, on the machine's monotonic clock.
+it sent, and when it started and ended, on the machine's monotonic clock, or in virtual time.
 """
 
 import array
@@ -21,14 +21,29 @@ from neuros.hooks import (
 )
 
 _NODE = json.loads(os.environ["CONFORMANCE"])
-_LOG = (Path(os.environ["NEUROS_RUN_DIR"]) / "observed.jsonl").open("w", buffering=1)
+_IS_VIRTUAL = _NODE.get("is_virtual", False)
+_FILE = Path(os.environ["NEUROS_RUN_DIR"]) / "observed.jsonl"
+# In virtual time nodes run in the program of the test, which must not be left an open file.
+_LOG = None if _IS_VIRTUAL else _FILE.open("w", buffering=1)
 _HEAD = struct.Struct("<IQ")
 _MANY, _PAUSE_S = 500, 0.002  # after so many executions a hook slows down
 _sequence = dict.fromkeys(_NODE["outputs"], 0)
 
 
 def _note(*entry):
-    _LOG.write(json.dumps(entry, separators=(",", ":")) + "\n")
+    line = json.dumps(entry, separators=(",", ":")) + "\n"
+    if _LOG is not None:
+        _LOG.write(line)
+        return
+    with _FILE.open("a") as log:
+        log.write(line)
+
+
+def _now_ns(node):
+    if not _IS_VIRTUAL:
+        return time.monotonic_ns()
+    now = node.now()
+    return now.sec * 1_000_000_000 + now.nanosec
 
 
 def _fill(packet, port, number):
@@ -84,13 +99,14 @@ def _body(hook):
 
     def body(node, *arguments):
         nonlocal count
-        start_ns = time.monotonic_ns()
+        start_ns = _now_ns(node)
         count += 1
         taken = [
             _seen(declared, argument)
             for declared, argument in zip(hook["inputs"], arguments, strict=True)
         ]
-        pause_s = max(hook["sleep_ms"] / 1000, _PAUSE_S if count > _MANY else 0)
+        slows_down = count > _MANY and not _IS_VIRTUAL
+        pause_s = max(hook["sleep_ms"] / 1000, _PAUSE_S if slows_down else 0)
         if pause_s:
             time.sleep(pause_s)
         packets, sent = [], {}
@@ -111,7 +127,7 @@ def _body(hook):
             sent[port] = _sequence[port]
         if count == hook["shutdown_at"]:
             node.shutdown("as described", drain_s=2.0)
-        _note(hook["name"], start_ns, time.monotonic_ns(), taken, sent)
+        _note(hook["name"], start_ns, _now_ns(node), taken, sent)
         if not sent:
             return None
         return packets[0] if len(packets) == 1 else tuple(packets)

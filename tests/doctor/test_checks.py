@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from neuros.backends.docker.back_end import look_at_containers
+from neuros.backends.docker.back_end import check_containers
 from neuros.doctor import checks
 from neuros.ports import Finding, FindingState
 from neuros.stacks import ProcessThreads
@@ -98,7 +98,7 @@ def test_a_finding_is_one_line_with_its_remedy() -> None:
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_without_an_engine_one_line_says_why_and_nothing_is_wrong(tmp_path: Path) -> None:
     environ = {"DOCKER_HOST": f"unix://{tmp_path}/none.sock"}
-    (finding,) = look_at_containers(["neuros_python"], environ)
+    (finding,) = check_containers(["neuros_python"], environ)
     assert finding.state is FindingState.ABSENT
     assert finding.subject == "Docker"
     assert f"{tmp_path}/none.sock" in finding.text

@@ -44,7 +44,7 @@ def last_round(
     ]
     declarations = Declarations(files)
     for name, specs in plugins.items():
-        declarations.take(declared(name, specs))
+        declarations.add(declared(name, specs))
     found = declarations.last_round(stopped)
     return {name: [plugins[name][place].name for place in places] for name, places in found.items()}
 

@@ -69,6 +69,13 @@ class TestIntegrator:
         assert network.steps_s == pytest.approx([0.02, 0.02])
         assert heading == pytest.approx(100 * 0.02 * 0.5)
 
+    def test_without_bridges_a_packet_that_was_lost_is_lost_angle(self, load):
+        network = FakeNetwork()
+        integrator = load("snn").GyroIntegrator(network, bridges=False)
+        integrator.integrate(PERIOD_NS, 0.5)
+        assert integrator.integrate(100 * PERIOD_NS, 0.5) == pytest.approx(2 * 0.02 * 0.5)
+        assert network.steps_s == pytest.approx([0.02, 0.02])
+
     def test_without_a_gap_the_heading_is_the_networks_own_bit_for_bit(self, load):
         network = FakeNetwork()
         integrator = load("snn").GyroIntegrator(network)
@@ -166,3 +173,29 @@ def test_the_floor_runs_the_experiment_without_neuros(load):
     assert found["rms_deg"] <= 5
     assert found["max_deg"] <= 12
     assert found["real_time_factor"] > 0
+
+
+class StandIn:
+    """A simulator of which only time and commands count."""
+
+    timestep = 0.002
+
+    def __init__(self):
+        self.sim_time = 0.0
+        self.rates = []
+
+    def actuate(self, name, value):
+        assert name == "pose_theta"
+        self.rates.append(value)
+
+
+def test_rates_change_with_simulated_time_and_only_where_they_vary(load):
+    pytest.importorskip("mujoco")
+    turning = load("turning_robot")
+    sim = StandIn()
+    robot = turning.TurningRobot(sim, 3.0, [0.5, -1.0], 1.0)
+    for sim.sim_time in (0.0, 0.98, 0.9999, 1.0, 2.5):
+        robot.turn()
+    assert sim.rates == [0.5, 0.5, -1.0, -1.0, 0.5]
+    turning.TurningRobot(sim, 3.0).turn()
+    assert len(sim.rates) == 5

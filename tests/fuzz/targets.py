@@ -29,7 +29,7 @@ from neuros_analysis.charts import load_figure
 from neuros_analysis.comparison import comparison_rows
 from neuros_analysis.findings import findings_of
 from neuros_analysis.review import open_for_review
-from neuros_analysis.run_pages import figures_of, panels_page, png, report_page, world_pages
+from neuros_analysis.run_pages import figures_of, panels_page, picture, report_page, world_pages
 from neuros_dashboard.live_metrics import ObservedRun
 from neuros_dashboard.pages import Pages
 from neuros_dashboard.server import Dashboard
@@ -401,7 +401,7 @@ def system_load(data: bytes, folder: Path) -> None:
     run = run_with("system_load.csv", data, folder)
     figure = load_figure(open_for_review(run))
     if figure is not None and crc32(data) % 8 == 0:  # it takes half a second
-        png(figure)
+        picture(figure)
 
 
 @target(seed_of("bag/bag.mcap"), change_bytes)
@@ -479,8 +479,8 @@ SENT: Sequence[control.Message] = (
     control.Probe(3),
     control.Drain({"a": (1, 2)}),
     control.Step(1, is_driven=True),
-    control.Look({"a": {"x": {}}}, 1),
-    control.StepAll(3),
+    control.GetStatus({"a": {"x": {}}}, 1),
+    control.Step(3),
     control.End("done"),
     control.PhaseChanged("running", is_paused=False),
     control.Ended(0, "done", {}, 1.0, None),

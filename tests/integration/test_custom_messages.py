@@ -43,6 +43,7 @@ joints.header.frame_id = "w\\u00e4nd"
 joints.limits[0].lower = -1.0
 joints.fixed[2] = 2.5
 assert (Joints.MANY, joints.label, joints.limits[1].upper) == (5, "none", 1.0)
+assert (joints.unit, Joints.PLACE) == ("\\u00b0", "Gr\\u00f6\\u00dfe \\u2014 \\u89d2\\u5ea6")
 told = Told(joints=joints, hash="x")
 for message in (joints, told, Move.Request(to=joints), Move.Response(done=True)):
     again = deserialize_message(serialize_message(message), type(message))

@@ -245,12 +245,15 @@ KEEPS_FROM_BEGINNING = """
 import sys
 from pathlib import Path
 from neuros.cli.main import main
-from neuros.launcher.start import Start
-def may_initialise(self):
-    if self._loaded >= self._names:
+from neuros.control import Begin
+from neuros.launcher.channels import Channels
+send = Channels.send
+def send_no_begin(self, message):
+    if isinstance(message, Begin):
         Path("loaded").touch()
-    return False
-Start.may_initialise = may_initialise
+    else:
+        send(self, message)
+Channels.send = send_no_begin
 sys.exit(main(["launch", *sys.argv[1:]]))
 """
 

@@ -12,7 +12,7 @@ from integration.test_steps_outside import observing
 from launching import BACKENDS
 
 import neuros
-from neuros.control import LookAll, NodeStatus, Pause, Resume
+from neuros.control import GetStatus, NodeStatus, Pause, Resume
 from neuros.control.link import ControlLink
 
 INT32 = "std_msgs/msg/Int32"
@@ -36,7 +36,7 @@ def take(node, x):
 
 def executions(link: ControlLink) -> int:
     """How often the hook of the receiver has run."""
-    link.send(LookAll({}))
+    link.send(GetStatus({}))
     while select.select([link], [], [], 1.0)[0]:
         for message in link.receive() or ():
             if isinstance(message, NodeStatus) and message.node == "b" and message.counters:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -246,3 +248,72 @@ def test_a_hook_that_waits_for_callbacks_is_told_what_to_do(backend: str, tmp_pa
             "rclpy.spin or SingleThreadedExecutor.add_node",
         )
     ]
+
+
+class TestTimersBesideBusyHooks:
+    """A hook that begins before a due timer is called makes the timer miss its next time."""
+
+    def test_a_timer_that_is_due_at_the_end_of_a_hook_is_called_before_the_next(
+        self, plugin: Plugin
+    ) -> None:
+        events: list[str] = []
+        timer = plugin.ros.create_timer(0.005, lambda: events.append("timer"))
+
+        def hook() -> None:
+            limit_s = time.monotonic() + LIMIT_S
+            while not timer.is_ready() and time.monotonic() < limit_s:
+                time.sleep(0.001)
+            events.append("hook")
+            plugin.loop.note_execution()
+            if events.count("hook") < 30:
+                plugin.loop.post(hook)
+            else:
+                plugin.stop()
+
+        plugin.loop.post(hook)
+        plugin.run()
+        assert ("hook", "hook") not in {*itertools.pairwise(events)}
+        assert not plugin.failures
+
+    def test_hooks_get_their_turn_beside_a_timer_that_is_always_due(self, plugin: Plugin) -> None:
+        hooks: list[int] = []
+
+        def tick() -> None:
+            limit_s = time.monotonic() + LIMIT_S
+            while not timer.is_ready() and time.monotonic() < limit_s:
+                time.sleep(0.0001)
+
+        timer = plugin.ros.create_timer(0.001, tick)
+
+        def hook() -> None:
+            hooks.append(len(hooks))
+            plugin.loop.note_execution()
+            if len(hooks) < 30:
+                plugin.loop.post(hook)
+            else:
+                plugin.stop()
+
+        plugin.loop.post(hook)
+        plugin.run()
+        assert len(hooks) == 30
+
+    def test_timers_that_the_plugin_destroys_do_no_harm(self, plugin: Plugin) -> None:
+        known, unknown = (plugin.ros.create_timer(0.001, lambda: None) for _ in range(2))
+        events: list[str] = []
+
+        def hook() -> None:
+            if not events:
+                plugin.ros.destroy_timer(known)
+                unknown.destroy()  # without telling the node
+            events.append("hook")
+            plugin.loop.note_execution()
+            if len(events) < 3:
+                plugin.loop.post(hook)
+            else:
+                plugin.stop()
+
+        plugin.loop.post(hook)
+        plugin.run()
+        assert len(events) == 3
+        assert not plugin.failures
+        assert not plugin.outside

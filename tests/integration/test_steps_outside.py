@@ -19,12 +19,12 @@ from neuros.backends.control_sockets import connect
 from neuros.backends.domain import choose_domain
 from neuros.control import (
     TO_OBSERVERS,
-    LookAll,
+    GetStatus,
     Message,
     NodeStatus,
     Pause,
     Resume,
-    StepAll,
+    Step,
     Watch,
 )
 from neuros.control.link import ControlLink
@@ -82,7 +82,7 @@ class Speaker:
             self._look()
 
     def _look(self) -> None:
-        self._link.send(LookAll({}))
+        self._link.send(GetStatus({}))
         while select.select([self._link], [], [], 0.02)[0]:
             for message in self._link.receive() or ():
                 if isinstance(message, NodeStatus) and message.counters is not None:
@@ -128,7 +128,7 @@ def test_a_step_takes_what_had_come_before_it_and_then_the_run_is_paused_again(
         beats, heard, arrived = speaker.beats, speaker.heard, speaker.arrived
         speaker.speak_until(lambda arrived=arrived: speaker.arrived >= arrived + 20)
         assert (speaker.beats, speaker.heard) == (beats, heard)
-        speaker.wish(StepAll(1))
+        speaker.wish(Step(1))
         speaker.speak_until(
             lambda beats=beats, heard=heard: speaker.beats > beats and speaker.heard >= heard + 10
         )

@@ -75,8 +75,13 @@ class Host:
     def loaded(self) -> None:
         """Its plugins are loaded; goes on when initialise hooks may start."""
         self.report()
-        self.send("loaded")
+        self.declare()
         self.wait_for("begin")
+
+    def declare(self) -> None:
+        """Its plugins are loaded."""
+        for name in NAMES:
+            self.send("hooks", node=name, hooks=[], finalise=[])
 
     def report(self, kind: str = "report", **fields: Any) -> None:
         """A report of a node that has been loaded."""

@@ -14,17 +14,15 @@ from neuros.control import (
     TO_OBSERVERS,
     End,
     Ended,
+    GetStatus,
     Hello,
     LogRecord,
-    Look,
-    LookAll,
     Message,
     NodeStatus,
     Pause,
     PhaseChanged,
     Resume,
     Step,
-    StepAll,
     Watch,
 )
 from neuros.control.link import ControlLink
@@ -61,7 +59,7 @@ class Run:
             self.channels.wait(5.0)
             for lines, message in self.channels.receive():
                 assert not isinstance(message, ControlError)
-                self.observers.take(lines, message)
+                self.observers.receive(lines, message)
                 count -= 1
 
 
@@ -85,10 +83,10 @@ def test_an_observer_is_told_the_phase_and_every_change_of_it(run: Run) -> None:
     lines = run.join()
     lines.send(Watch())
     run.hear()
-    run.observers.look_at(Phase.RUNNING)
-    run.observers.look_at(Phase.RUNNING)
-    run.observers.look_at(Phase.DRAINING)
-    run.observers.part(Outcome(3, "why"))
+    run.observers.update(Phase.RUNNING)
+    run.observers.update(Phase.RUNNING)
+    run.observers.update(Phase.DRAINING)
+    run.observers.end(Outcome(3, "why"))
     assert told(lines, 3) == [
         PhaseChanged("running", False),
         PhaseChanged("draining", False),
@@ -105,14 +103,14 @@ def test_what_nodes_show_goes_to_the_observer_that_asked(run: Run) -> None:
         observer.send(Watch())
         run.hear()
     for observer, wanted in ((first, {"a": {"x": {}}}), (second, {})):
-        observer.send(LookAll({"b": {}}))
-        observer.send(LookAll(wanted))  # takes the place of what was not asked yet
+        observer.send(GetStatus({"b": {}}))
+        observer.send(GetStatus(wanted))  # takes the place of what was not asked yet
         run.hear(2)
-    run.observers.look_at(Phase.RUNNING)
+    run.observers.update(Phase.RUNNING)
     looks = told(node, 2)
-    assert looks == [Look({"a": {"x": {}}}, 1), Look({}, 2)]
+    assert looks == [GetStatus({"a": {"x": {}}}, 1), GetStatus({}, 2)]
     for look in looks:
-        assert isinstance(look, Look)
+        assert isinstance(look, GetStatus)
         samples = {port: dict(each) for port, each in look.wanted.get("a", {}).items()}
         node.send(NodeStatus("a", look.asker, samples=samples))
     run.hear(2)
@@ -133,11 +131,11 @@ def test_pause_step_and_resume_reach_the_nodes_and_time_is_kept(run: Run) -> Non
     observer.send(Watch())
     run.hear()
     for message in (
-        StepAll(1),  # it is not paused: nothing happens
+        Step(1),  # it is not paused: nothing happens
         Pause(),
         Pause(),
-        StepAll(3),
-        StepAll(-1),
+        Step(3),
+        Step(-1),
     ):
         observer.send(message)
     run.hear(5)
@@ -159,19 +157,19 @@ def test_a_run_goes_on_when_nobody_is_left_to_resume_it(run: Run) -> None:
     observer.send(Watch())
     observer.send(Pause())
     run.hear(2)
-    run.observers.look_at(Phase.RUNNING)
+    run.observers.update(Phase.RUNNING)
     assert run.pause.is_on
     observer.close()
     while run.pause.is_on:
         run.channels.wait(5.0)
         assert list(run.channels.receive()) == []
-        run.observers.look_at(Phase.RUNNING)
+        run.observers.update(Phase.RUNNING)
 
 
 def test_the_end_of_a_run_ends_a_pause(run: Run) -> None:
     run.pause.begin()
     run.now_s += 2.0
-    run.observers.look_at(Phase.DRAINING)
+    run.observers.update(Phase.DRAINING)
     run.now_s += 2.0
     assert (run.pause.is_on, run.pause.total_s) == (False, 2.0)
 

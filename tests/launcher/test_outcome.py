@@ -59,6 +59,6 @@ def test_what_a_reset_takes_back_has_passed() -> None:
 
 def test_the_time_in_which_the_launcher_stood_still_makes_no_report_older() -> None:
     ended = Outcome()
-    ended.take(Report(node="robot", is_final=True), 3.0)
-    ended.excuse(10.0)
+    ended.add(Report(node="robot", is_final=True), 3.0)
+    ended.shift(10.0)
     assert ended.final_report_s("robot") == 13.0

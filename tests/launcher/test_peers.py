@@ -38,7 +38,7 @@ class Launcher:
         )
         self.said: list[PeerState] = []
         self.peers = Peers("own", ["b", "c"], [file], " (hint)", timeout_s)
-        self.peers.speak_through(self._note)
+        self.peers.publish_through(self._note)
 
     def _note(self, text: str) -> None:
         state = state_from(text)
@@ -46,7 +46,7 @@ class Launcher:
         self.said.append(state)
 
     def hears(self, node: str, state: PeerState | None, now_s: float = 0.0) -> None:
-        self.peers.hear(node, None if state is None else state.to_text(), now_s)
+        self.peers.receive(node, None if state is None else state.to_text(), now_s)
 
     def remarks(self, now_s: float) -> list[str]:
         return [text for _, text in self.peers.remarks(now_s)]
@@ -134,16 +134,16 @@ def test_without_a_limit_nodes_elsewhere_are_waited_for_for_ever(launcher: Launc
 
 def test_nor_is_what_is_none_of_ours(launcher: Launcher) -> None:
     for text in ("", "ready", "[1]", '{"a": 1}'):
-        launcher.peers.hear("b", text, 0.0)
+        launcher.peers.receive("b", text, 0.0)
     assert launcher.peers.end(100.0) is None
 
 
 def test_alone_there_is_nothing_to_say() -> None:
     alone = Peers("own", [], [])
     said: list[str] = []
-    alone.speak_through(said.append)
+    alone.publish_through(said.append)
     alone.drain("enough", 5.0)
-    assert alone.settle({})
+    assert alone.agree_on_end({})
     alone.stop(0, "enough")
     assert not alone.exist
     assert said == []
@@ -211,31 +211,31 @@ def test_a_node_that_was_replaced_is_gone(launcher: Launcher) -> None:
 def test_it_is_drained_when_both_launchers_are_and_nothing_is_between(launcher: Launcher) -> None:
     launcher.hears("b", ELSEWHERE)
     launcher.peers.drain("enough", 5.0)
-    assert not launcher.peers.settle(sent(3)), "the peer has not heard of it yet"
+    assert not launcher.peers.agree_on_end(sent(3)), "the peer has not heard of it yet"
     assert said_last(launcher).phase == DRAINED
     drained = replace(ELSEWHERE, phase=DRAINED)
     launcher.hears("b", replace(drained, number=2, counters=received(2)))
-    assert not launcher.peers.settle(sent(3)), "a packet is under way"
+    assert not launcher.peers.agree_on_end(sent(3)), "a packet is under way"
     launcher.hears("b", replace(drained, number=3, counters=received(3)))
-    assert not launcher.peers.settle(sent(3, acknowledged=2)), "an acknowledgement is"
-    assert launcher.peers.settle(sent(3))
+    assert not launcher.peers.agree_on_end(sent(3, acknowledged=2)), "an acknowledgement is"
+    assert launcher.peers.agree_on_end(sent(3))
 
 
 def test_it_says_so_when_it_has_something_to_do_again(launcher: Launcher) -> None:
     launcher.hears("b", ELSEWHERE)
     launcher.peers.drain("enough", 5.0)
-    launcher.peers.settle(sent(3))
-    launcher.peers.unsettle()
+    launcher.peers.agree_on_end(sent(3))
+    launcher.peers.go_on()
     assert said_last(launcher).phase == DRAINING
     number = len(launcher.said)
-    launcher.peers.unsettle()
+    launcher.peers.go_on()
     assert len(launcher.said) == number, "once"
 
 
 def test_a_peer_that_has_stopped_is_not_asked(launcher: Launcher) -> None:
     launcher.hears("b", ELSEWHERE)
     launcher.hears("b", replace(ELSEWHERE, number=2, phase=STOPPING))
-    assert launcher.peers.settle(sent(3))
+    assert launcher.peers.agree_on_end(sent(3))
 
 
 # ------------------------------------------------------------------ the counters

@@ -321,10 +321,10 @@ def test_two_equal_rounds_never_miss_what_is_under_way(steps: list[tuple[str, in
         elif step == "answer":
             name = "abc"[index]
             answered.add(name)
-            probing.take(world.probe(name, asked[-1]))
+            probing.add(world.probe(name, asked[-1]))
         if len(answered) == 3:
             answered = set()
-            if probing.look(now_s, 0.0) is Verdict.DRAINED:
+            if probing.check(now_s, 0.0) is Verdict.DRAINED:
                 assert not world.flights
                 assert not any(map(world.unread, RING))
                 return
@@ -335,9 +335,9 @@ def test_a_project_that_rests_is_found_drained_after_two_rounds() -> None:
     probing = Probing("ab", [AB], asked_into(asked))
     probing.drain(without=(), now_s=0.0)
     for now_s in (1.0, 2.0):
-        probing.take(sender(AB, 3, 3, number=asked[-1]))
-        probing.take(receiver(AB, 3, 3, number=asked[-1]))
-        verdict = probing.look(now_s, 0.0)
+        probing.add(sender(AB, 3, 3, number=asked[-1]))
+        probing.add(receiver(AB, 3, 3, number=asked[-1]))
+        verdict = probing.check(now_s, 0.0)
     assert verdict is Verdict.DRAINED
     assert asked == [1, 2]
 
@@ -346,25 +346,25 @@ def test_answers_to_older_questions_do_not_count() -> None:
     asked: list[int] = []
     probing = Probing("a", [], asked_into(asked))
     probing.drain(without=(), now_s=0.0)
-    probing.take(probe())
-    probing.take(probe(number=asked[-1] - 1))
-    probing.look(1.0, 0.0)
+    probing.add(probe())
+    probing.add(probe(number=asked[-1] - 1))
+    probing.check(1.0, 0.0)
     assert asked == [1], "nobody has answered yet"
 
 
 def test_without_a_node_that_ever_began_there_is_nothing_to_drain() -> None:
     probing = Probing("ab", [AB], lambda _: None)
     probing.drain(without="ab", now_s=0.0)
-    assert probing.look(0.0, 0.0) is Verdict.DRAINED
+    assert probing.check(0.0, 0.0) is Verdict.DRAINED
 
 
 def test_nobody_is_asked_while_something_moves() -> None:
     asked: list[int] = []
     probing = Probing("a", [], asked_into(asked))
-    probing.look(10.0, 0.9)
+    probing.check(10.0, 0.9)
     assert asked == []
-    probing.look(11.0, 1.0)
-    probing.look(11.1, 1.1)
+    probing.check(11.0, 1.0)
+    probing.check(11.1, 1.1)
     assert asked == [1], "and then not too often"
 
 
@@ -375,9 +375,9 @@ def test_the_longer_nothing_moves_the_more_rarely_nodes_are_asked_until_somethin
     for tick in range(1, 600):
         now_s = tick / 10
         has_moved_s = 50.0 if now_s >= 50.0 else 0.0
-        probing.look(now_s, now_s - has_moved_s)
+        probing.check(now_s, now_s - has_moved_s)
         if asked and asked[-1] == now_s:
-            probing.take(probe(number=len(asked), is_wakeable=True))
+            probing.add(probe(number=len(asked), is_wakeable=True))
     assert asked[:5] == [1.0, 1.5, 2.5, 4.5, 6.5], "two soon, for a deadlock; then ever later"
     assert [at for at in asked if at >= 50.0][:3] == [51.0, 51.5, 52.5], "and soon again"
 
@@ -386,10 +386,10 @@ def test_a_deadlock_is_found_after_two_rounds_and_explained_with_its_cures() -> 
     asked: list[int] = []
     probing = Probing("ab", [AB], asked_into(asked))
     for now_s in (10.0, 11.0):
-        assert probing.look(now_s, now_s) is Verdict.UNDECIDED
-        probing.take(sender(AB, 1, 0, number=asked[-1]))
-        probing.take(receiver(AB, 1, 0, number=asked[-1]))
-    assert probing.look(11.1, 11.1) is Verdict.DEAD
+        assert probing.check(now_s, now_s) is Verdict.UNDECIDED
+        probing.add(sender(AB, 1, 0, number=asked[-1]))
+        probing.add(receiver(AB, 1, 0, number=asked[-1]))
+    assert probing.check(11.1, 11.1) is Verdict.DEAD
     text = probing.why_dead()
     assert "a is blocked on `a.o -> b.x` (1 outstanding)" in text
     assert "leave out discard_limit" in text
@@ -399,13 +399,13 @@ def test_where_there_is_no_loop_the_deadlock_names_the_node_that_has_nothing_lef
     asked: list[int] = []
     probing = Probing("ab", [AB], asked_into(asked))
     for now_s in (10.0, 11.0):
-        probing.look(now_s, now_s)
-        probing.take(sender(AB, 0, 0, number=asked[-1]))
+        probing.check(now_s, now_s)
+        probing.add(sender(AB, 0, 0, number=asked[-1]))
         waits_for_x = receiver(AB, 0, 0, number=asked[-1])
         waits_for_x.metrics["state"].update(state="waiting", cause="x")
         waits_for_x.metrics["incoming"][str(AB)]["unread"] = 0
-        probing.take(waits_for_x)
-    assert probing.look(11.1, 11.1) is Verdict.DEAD
+        probing.add(waits_for_x)
+    assert probing.check(11.1, 11.1) is Verdict.DEAD
     text = probing.why_dead()
     assert "b waits for `x` from a. No hook of a is left to run: let one send" in text
     assert "loop" not in text
@@ -413,8 +413,8 @@ def test_where_there_is_no_loop_the_deadlock_names_the_node_that_has_nothing_lef
 
 def test_a_project_that_has_no_hook_left_is_told_to_end() -> None:
     probing = Probing("ab", [AB], lambda _: None)
-    probing.take(sender(AB, 0, 0, number=0))
-    probing.take(receiver(AB, 0, 0, number=0))
+    probing.add(sender(AB, 0, 0, number=0))
+    probing.add(receiver(AB, 0, 0, number=0))
     assert probing.why_dead() == (
         "deadlock: nothing can ever run again: no hook can run. If the work is done, let a hook"
         " call node.shutdown"
@@ -425,12 +425,12 @@ def test_what_is_left_names_who_is_busy_or_where_packets_are() -> None:
     asked: list[int] = []
     probing = Probing("ab", [AB], asked_into(asked))
     probing.drain(without=(), now_s=0.0)
-    probing.take(sender(AB, 2, 1, number=1))
+    probing.add(sender(AB, 2, 1, number=1))
     assert probing.what_is_left(1.0) == ["b does not answer"]
-    probing.take(receiver(AB, 1, 1, is_startable=True, number=1))
+    probing.add(receiver(AB, 1, 1, is_startable=True, number=1))
     left = ["a packet is under way on `a.o -> b.x`", "b has a packet to work on"]
     assert probing.what_is_left(1.0) == left
-    probing.look(2.0, 0.0)
+    probing.check(2.0, 0.0)
     assert asked == [1, 2]
     assert probing.what_is_left(2.01) == left, "the next answers are on their way"
     assert probing.what_is_left(3.0) == ["a does not answer", "b does not answer"]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from neuros.control import Advance, AtRest, Message, Pause
 from neuros.control.link import ControlLink
-from neuros.launcher.channels import Channels, Settling
+from neuros.launcher.channels import Channels, RestDetector
 
 SESSION = cast(ControlLink, "the session")
 
@@ -36,7 +36,7 @@ class World:
         self.answers: deque[AtRest] = deque()
         self.settled: list[Message] = []
         self.now_s = 0.0
-        self.settling = Settling(self.names, cast(Channels, self), lambda: self.now_s)
+        self.settling = RestDetector(self.names, cast(Channels, self), lambda: self.now_s)
 
     def pairs(self) -> list[tuple[str, str]]:
         return [(a, b) for a in self.names for b in self.names if a != b]
@@ -65,7 +65,7 @@ class World:
         ways += [(self.hear, "")] * bool(self.answers)
         if not ways or self.source.random() < 0.1:
             self.now_s += 0.01
-            self.settling.look()
+            self.settling.check()
         else:
             act, name = self.source.choice(ways)
             act(name)
@@ -93,7 +93,7 @@ class World:
         self.answers.append(AtRest(number, {}, {}, (name,), True, sent, received))
 
     def hear(self, _: str) -> None:
-        self.settling.take(self.answers.popleft())
+        self.settling.add(self.answers.popleft())
 
 
 @given(size=st.integers(2, 4), packets=st.integers(0, 30), seed=st.integers(0, 2**32))
@@ -129,57 +129,57 @@ def asked() -> Asked:
 
 
 def test_one_process_is_asked_once(asked: Asked) -> None:
-    settling = Settling(["a", "b"], cast(Channels, asked))
+    settling = RestDetector(["a", "b"], cast(Channels, asked))
     settling.ask(SESSION, Advance(1, 0, {"a.x": 3}))
     assert asked.rounds == [Advance(1, 0, {"a.x": 3})]
     newest = {"a.x": (4, [b""])}
-    settling.take(AtRest(1, {"a": 0.5}, newest, ("a", "b")))
+    settling.add(AtRest(1, {"a": 0.5}, newest, ("a", "b")))
     assert asked.told == [AtRest(1, {"a": 0.5}, newest)]
 
 
 def test_packets_of_a_lossy_connection_are_given_up_after_a_while(asked: Asked) -> None:
     now_s = 0.0
-    settling = Settling(["a", "b"], cast(Channels, asked), lambda: now_s)
+    settling = RestDetector(["a", "b"], cast(Channels, asked), lambda: now_s)
     settling.ask(SESSION, Advance(1, 0, {}))
     while not asked.told:
         number = asked.rounds[-1].number
-        settling.take(AtRest(number, {}, {}, ("a",), True, {"a.x -> b.y": (3, -1)}, {}))
-        settling.take(AtRest(number, {}, {}, ("b",), True, {}, {"a.x -> b.y": (2, -1)}))
+        settling.add(AtRest(number, {}, {}, ("a",), True, {"a.x -> b.y": (3, -1)}, {}))
+        settling.add(AtRest(number, {}, {}, ("b",), True, {}, {"a.x -> b.y": (2, -1)}))
         now_s += 0.01
-        settling.look()
+        settling.check()
     assert 0.1 <= now_s < 0.2
 
 
 def test_nodes_that_have_not_begun_are_waited_for(asked: Asked) -> None:
     now_s = 0.0
-    settling = Settling(["a", "b"], cast(Channels, asked), lambda: now_s)
+    settling = RestDetector(["a", "b"], cast(Channels, asked), lambda: now_s)
     asked.greeted = {"a"}
     settling.ask(SESSION, Advance(1, 0, {}))
     assert not asked.rounds
     asked.greeted = {"a", "b"}
     now_s += 1.0
-    settling.look()
-    settling.take(AtRest(asked.rounds[-1].number, {}, {}, ("a", "b"), False, {}, {}))
+    settling.check()
+    settling.add(AtRest(asked.rounds[-1].number, {}, {}, ("a", "b"), False, {}, {}))
     assert not asked.told
     now_s += settling.wait_s + 1.0
-    settling.look()
-    settling.take(AtRest(asked.rounds[-1].number, {}, {}, ("a", "b"), True, {}, {}))
+    settling.check()
+    settling.add(AtRest(asked.rounds[-1].number, {}, {}, ("a", "b"), True, {}, {}))
     assert asked.told
 
 
 def test_who_lets_the_run_go_on_is_answered_no_more_and_holds_it_no_more(asked: Asked) -> None:
     now_s = 0.0
-    settling = Settling(["a"], cast(Channels, asked), lambda: now_s)
+    settling = RestDetector(["a"], cast(Channels, asked), lambda: now_s)
     settling.ask(SESSION, Advance(1, 0, {}))
     not_begun = AtRest(asked.rounds[-1].number, {}, {}, ("a",), False, {}, {})
-    settling.take(not_begun)
+    settling.add(not_begun)
     settling.give_up(cast(ControlLink, object()))
     now_s += settling.wait_s + 1.0
-    settling.look()
+    settling.check()
     assert len(asked.rounds) == 2
     settling.give_up(SESSION)
-    settling.take(AtRest(asked.rounds[-1].number, {}, {}, ("a",), True, {}, {}))
+    settling.add(AtRest(asked.rounds[-1].number, {}, {}, ("a",), True, {}, {}))
     now_s += 1.0
-    settling.look()
+    settling.check()
     assert len(asked.rounds) == 2
     assert not asked.told

@@ -73,7 +73,7 @@ def detector_of(*names: str) -> StallDetector:
     detector.greet(names, {}, 0.0)
     for name in names:
         detector.report(report(name), 0.0)
-        detector.note_ready(name)
+        detector.ready.add(name)
     return detector
 
 
@@ -99,6 +99,21 @@ def test_a_standstill_is_asked_about_once_after_five_seconds() -> None:
     assert not detector.has_just_stalled(50.0)
 
 
+def test_each_node_tells_why_it_does_not_move_unless_it_executes_a_hook_or_is_silent() -> None:
+    detector = detector_of("a", "b", "busy", "silent")
+    for name in ("a", "b", "busy", "silent"):
+        detector.greet([name], {}, 0.0)
+        if name == "silent":
+            continue
+        found = report(name, executing=executing(9.0) if name == "busy" else None)
+        found.reasons = ("waits for `x` from b", "and more")
+        detector.report(found, 5.0)
+    assert [*detector.reasons(5.0)] == [
+        ("WARN", "a waits for `x` from b; and more"),
+        ("WARN", "b waits for `x` from b; and more"),
+    ]
+
+
 def test_the_next_standstill_is_asked_about_again() -> None:
     detector = detector_of("a")
     assert detector.has_just_stalled(5.0)
@@ -115,7 +130,7 @@ def test_a_packet_that_arrives_is_a_movement() -> None:
 
 def test_while_the_launcher_itself_stood_still_nobody_rested_or_was_silent() -> None:
     detector = detector_of("a")
-    detector.excuse(10.0)
+    detector.shift(10.0)
     assert not detector.has_just_stalled(14.9)
     assert remarks(detector, 14.9) == []
     assert detector.has_just_stalled(15.0)
@@ -208,7 +223,7 @@ def test_nodes_that_start_slowly_are_named() -> None:
     detector = StallDetector(["a", "b", "c"], 0.0, reader_of(ProcessThreads()))
     detector.greet(["b", "c"], {}, 0.0)
     detector.report(LOADING, 4.0)
-    detector.note_loaded("c")  # and waits for the others in its process
+    detector.loaded.add("c")  # and waits for the others in its process
     detector.report(structs.replace(LOADING, node="c"), 4.0)
     assert remarks(detector, 5.0) == ["still starting: a", "still importing their plugins: b"]
 
@@ -216,11 +231,11 @@ def test_nodes_that_start_slowly_are_named() -> None:
 def test_nodes_that_keep_the_others_waiting_are_named() -> None:
     slow = StallDetector(["a", "b"], 0.0, reader_of(ProcessThreads()))
     slow.greet(["a", "b"], {}, 0.0)
-    slow.note_ready("a")
+    slow.ready.add("a")
     for name in ("a", "b"):
         slow.report(report(name), 4.0)
     assert remarks(slow, 5.0) == ["still initialising: b"]
-    slow.note_ready("b")
+    slow.ready.add("b")
     for name in ("a", "b"):
         slow.report(report(name), 14.0)
     assert remarks(slow, 15.0) == []

@@ -17,7 +17,7 @@ from neuros.backends.process_launchers import ProcessLauncher, RunningProcess
 from neuros.control import Begin, Message
 from neuros.control.link import ControlLink
 from neuros.errors import EnvironmentFault
-from neuros.launcher import shutdown
+from neuros.launcher import supervisor
 from neuros.launcher.channels import Channels
 from neuros.launcher.peers import PeerState, Stage
 
@@ -89,7 +89,7 @@ host.hello()
 Path('b.up').touch()
 while host.hear()['kind'] != 'stop':
     pass
-host.send('loaded')
+host.declare()
 host.tell('failed', text='it cannot be imported')
 Path('b.loaded').touch()
 host.wait_for('never')
@@ -107,7 +107,7 @@ time.sleep(60)
     assert told_to_begin == []
 
 
-@pytest.mark.parametrize(("tells", "goes_on_at"), [("loaded", "begin"), ("ready", "activate")])
+@pytest.mark.parametrize(("tells", "goes_on_at"), [("hooks", "begin"), ("ready", "activate")])
 def test_no_node_goes_on_before_all_have_caught_up(run: Run, tells: str, goes_on_at: str) -> None:
     """Each notes when it may go on; the last one makes the others wait until it has told."""
     goes_on = f"""
@@ -117,11 +117,11 @@ if {tells!r} == "ready":
 if NAMES == ["c"]:
     time.sleep(0.3)
     Path("c.tells").touch()
-host.send({tells!r}, **({{"node": NAMES[0]}} if {tells!r} == "ready" else {{}}))
+host.send("ready", node=NAMES[0]) if {tells!r} == "ready" else host.declare()
 host.wait_for({goes_on_at!r})
 assert Path("c.tells").exists()
 host.ask("end", reason="enough")
-host.send("loaded")
+host.declare()
 host.send("ready", node=NAMES[0])
 host.serve()
 """
@@ -179,7 +179,7 @@ def test_nothing_begins_where_not_all_could_be_started(
         raise EnvironmentFault("the third one cannot be started")
 
     monkeypatch.setattr(ProcessLauncher, "start", start_and_fail)
-    loads = "host.hello(); host.send('loaded'); Path('a.loaded').touch(); host.wait_for('begin')"
+    loads = "host.hello(); host.declare(); Path('a.loaded').touch(); host.wait_for('begin')"
     with pytest.raises(EnvironmentFault):
         run(a=loads)
     assert told_to_begin == []
@@ -198,7 +198,7 @@ def test_one_that_has_not_started_and_outlasts_its_kill_is_named_so(
             kill(process)
 
     monkeypatch.setattr(RunningProcess, "kill", kill_at_the_second_time)
-    monkeypatch.setattr(shutdown, "_KILLED_S", 0.5)
+    monkeypatch.setattr(supervisor, "_KILLED_S", 0.5)
     interrupts = "host.hello(); host.ask('interrupt'); host.wait_for('never')"
     outcome = run(a=interrupts, b="host.hello(); time.sleep(60)")
     assert outcome.exit_code == 130
@@ -470,7 +470,7 @@ def test_there_is_no_deadlock_while_a_node_could_still_wake(run: Run) -> None:
 
 def test_nor_where_other_nodes_run_elsewhere(run: Run) -> None:
     state = PeerState("another run", "far", 1, Stage.READY).to_text()
-    hears = f"host.hello(); host.send('heard', node='b', text={state!r}); host.loaded()"
+    hears = f"host.hello(); host.send('state_of_peer', node='b', text={state!r}); host.loaded()"
     outcome = run(a=f"{hears}; host.ready(); host.serve()", duration_s=2.5, elsewhere=("b",))
     assert outcome.exit_code == 0
 

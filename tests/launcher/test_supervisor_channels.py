@@ -18,13 +18,12 @@ from neuros.control import (
     Deliver,
     End,
     Ended,
-    Explanation,
     Failed,
+    GetStatus,
     Hello,
     LogRecord,
-    Look,
-    LookAll,
     Probe,
+    Progress,
     Ready,
     Stop,
     WasReset,
@@ -89,9 +88,9 @@ def test_several_hundred_kilobytes_are_one_go_too(channels: Channels, node: Node
     node.socket.setblocking(False)
     node.send(Hello(("a",)))
     count = 0
-    while node.send(Explanation("a", ("x" * 1000,))):
+    while node.send(Progress("a", "x" * 1000)):
         count += 1
-    assert kinds(channels)[1 : count + 1] == ["explanation"] * count
+    assert kinds(channels)[1 : count + 1] == ["progress"] * count
 
 
 def test_half_a_message_waits_for_its_other_half(channels: Channels, node: Node) -> None:
@@ -178,15 +177,15 @@ def test_other_programs_are_heard_in_turns_and_nodes_in_full(
     flood = Node(tmp_path)
     flood.send(Watch())
     flood.socket.setblocking(False)
-    while flood.send(LookAll({})):
+    while flood.send(GetStatus({})):
         pass
     node.socket.setblocking(False)
     count = 0
-    while node.send(Explanation("a", ("x" * 1000,))):
+    while node.send(Progress("a", "x" * 1000)):
         count += 1
     heard = kinds(channels)
-    assert heard.count("explanation") >= count
-    assert heard.count("look_all") < 5000
+    assert heard.count("progress") >= count
+    assert heard.count("get_status") < 5000
     flood.close()
 
 
@@ -211,7 +210,7 @@ def test_the_end_of_a_run_reaches_a_node_to_which_much_is_to_be_sent(
     node.send(Hello(("a",)))
     assert kinds(channels) == ["hello"]
     for _ in range(300):
-        channels.send(Look({"a": {"x" * 10_000: {}}}, 1))
+        channels.send(GetStatus({"a": {"x" * 10_000: {}}}, 1))
     channels.send(Stop())
     got = received(channels, node, until=Stop())
     assert got[-1] == Stop()

@@ -270,12 +270,6 @@ def test_a_node_that_is_not_understood_makes_the_run_fail(
     assert all(map(outcome.has_final_report, "ab"))
 
 
-def test_explanations_are_shown_one_line_per_node(run: Run) -> None:
-    explains = "host.up(); host.tell('explanation', lines=['waits for `x` from b', 'and more']); "
-    run(a=explains + "host.tell('shutdown', reason='', drain_s=5); host.serve()")
-    assert "a waits for `x` from b; and more" in run.output.said
-
-
 # ------------------------------------------------------------------ time to finalise
 
 

@@ -23,6 +23,7 @@ def test_what_ros_understands_is_no_problem(tmp_path: Path) -> None:
         "# a joint [rad]\n\nstd_msgs/Header header  # when\nfloat64[] angles\nOther other\n"
         "string<=8 name 'x'\nint32[3] three [1, 2, 3]\nfloat32[<=4] few\nuint8 LEFT=1\n"
         "string SIDE='a # b'\nwstring w\nbool b true\n   # an indented comment\n\tint8\ttabbed\n"
+        "float32 heat 20.5  # [°C] ± 0.5, 温度\nstring<=8 named 'é—日'\nstring UNIT=°C\n"
     )
     text = text.replace("string SIDE='a # b'\n", "string SIDE='left'\n").replace("\tint8", "int8")
     file = tmp_path / "Joints.msg"
@@ -76,7 +77,7 @@ def test_what_ros_understands_is_no_problem(tmp_path: Path) -> None:
         ("std_msgs/Header h 3", "2:17", "expected no value behind the name"),
         (" float64 x", "2:1", "found a space in front, expected the type in the first column"),
         ("float64 ok", "2:9", "found the name 'ok' again (see line 1), expected another"),
-        ("float64 x  # 5 — 6", "2:16", "found '—', expected ASCII"),
+        ("string[] x ['a', 'é']", "2:19", "found 'é' in the default of an array, expected ASCII"),
     ],
 )
 def test_a_mistake_is_said_with_its_place(tmp_path: Path, line: str, where: str, said: str) -> None:

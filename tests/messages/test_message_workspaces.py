@@ -17,6 +17,7 @@ from neuros.messages import needed
 from neuros.messages.needed import Compilers, Messages
 from neuros.messages.package import find_packages
 from neuros.messages.workspace import Built, Workspaces, message_cache, sweep
+from neuros.project.message_types import unknown_type
 from neuros.project.model import Node, Port
 
 POINT = {"msg/Point.msg": "float64 x\n"}
@@ -127,6 +128,12 @@ class TestOrder:
         assert "package.xml:1:1: found packages that need each other: " in problem
         assert "a_msgs -> b_msgs" in problem
 
+    def test_a_package_that_only_messages_name_is_built_before_them(self, bench: Bench) -> None:
+        write_package(bench.own, "a_msgs", {"msg/A.msg": "b_msgs/Point[3] p\n"})
+        write_package(bench.shared, "b_msgs", POINT)
+
+        assert [each.package for each in bench.messages("a_msgs").built] == ["b_msgs", "a_msgs"]
+
 
 class TestKeys:
     """A package is built again when something has changed that matters, and only then."""
@@ -148,6 +155,14 @@ class TestKeys:
 
     def test_it_changes_with_what_it_needs(self, bench: Bench) -> None:
         write_package(bench.own, "a_msgs", POINT, ["b_msgs"])
+        other = write_package(bench.own, "b_msgs", POINT)
+        before = bench.key("a_msgs")
+        (other / "msg/Point.msg").write_text("float32 x\n")
+
+        assert bench.key("a_msgs") != before
+
+    def test_it_changes_with_what_only_its_messages_name(self, bench: Bench) -> None:
+        write_package(bench.own, "a_msgs", {"msg/A.msg": "b_msgs/Point p\n"})
         other = write_package(bench.own, "b_msgs", POINT)
         before = bench.key("a_msgs")
         (other / "msg/Point.msg").write_text("float32 x\n")
@@ -186,10 +201,15 @@ class TestMistakes:
     @pytest.mark.parametrize(
         ("field", "said"),
         [
-            ("std_msgs/Header h", "expected <depend>std_msgs</depend> in package.xml"),
             ("sensor_msgs/Imuu i", "expected a message of 'sensor_msgs' (did you mean 'Imu'?)"),
-            ("sensr_msgs/Imu i", "is here (did you mean 'sensor_msgs'?)"),
-            ("nothing_like_it/X x", "is here (there is no package 'nothing_like_it')"),
+            (
+                "sensr_msgs/Imu i",
+                "is here (did you mean 'sensor_msgs'? If 'sensr_msgs' exists",
+            ),
+            (
+                "no_such/X x",
+                "is here (there is no package 'no_such'. If 'no_such' exists",
+            ),
             ("Pint p", "expected a message of 'a_msgs' (did you mean 'Point'?)"),
         ],
     )
@@ -201,6 +221,50 @@ class TestMistakes:
 
         assert "a_msgs/msg/A.msg:2:1: found '" in problem
         assert said in problem
+
+    def test_a_dependency_through_another_package_is_no_mistake(self, bench: Bench) -> None:
+        """As in mavros_msgs: ROS finds std_msgs through geometry_msgs, which the manifest names."""
+        files = {"msg/A.msg": "std_msgs/Header header\ngeometry_msgs/Pose pose\n"}
+        write_package(bench.own, "a_msgs", files, ["geometry_msgs"])
+
+        assert bench.problems() == []
+        (doubt,) = bench.messages().doubts()
+        said = "a_msgs/package.xml:1:1: no <depend>std_msgs</depend>, and message files use"
+        assert said in str(doubt)
+
+    def test_messages_in_a_folder_of_another_name_are_named_with_it(self, bench: Bench) -> None:
+        write_package(bench.own, "a_msgs", {"messages/A.msg": "int32 a\n", "messages/B.msg": ""})
+
+        (problem,) = bench.problems()
+
+        assert "a_msgs/messages/A.msg:1:1: found A.msg in the folder 'messages', " in problem
+        assert "expected it in the folder 'msg' beside package.xml (and 1 more)" in problem
+
+    def test_a_field_whose_message_is_in_another_folder_says_where(self, bench: Bench) -> None:
+        files = {"msg/A.msg": "Deep d\n", "msg/more/Deep.msg": "int32 a\n"}
+        write_package(bench.own, "a_msgs", files)
+
+        (problem,) = bench.problems()
+
+        assert "a_msgs/msg/A.msg:1:1: found 'a_msgs/Deep', expected a message of" in problem
+        assert "(found Deep.msg in the folder 'msg/more', expected it in the folder" in problem
+
+    def test_a_port_whose_message_is_in_another_folder_says_where(self, bench: Bench) -> None:
+        write_package(bench.own, "a_msgs", {**POINT, "other/Deep.msg": "int32 a\n"})
+
+        found = unknown_type("a_msgs/msg/Deep", must_be_here=True, packages=bench.workspaces)
+
+        assert found is not None
+        assert found[1].startswith("found Deep.msg in the folder 'other'")
+
+    def test_message_files_of_a_package_that_builds_none_are_left_alone(self, bench: Bench) -> None:
+        folder = write_package(bench.own, "just_code", {"test/A.msg": "int32 a\n"})
+        text = (folder / "package.xml").read_text()
+        for name in ("rosidl_interface_packages", "rosidl_default_generators"):
+            text = text.replace(name, "something_else")
+        (folder / "package.xml").write_text(text)
+
+        assert find_packages(bench.own) == ([], [])
 
     def test_a_message_cannot_contain_itself(self, bench: Bench) -> None:
         files = {"msg/A.msg": "B b\n", "msg/B.msg": "A a\n"}
@@ -323,7 +387,7 @@ class TestCache:
 
     def test_using_it_keeps_it(self, bench: Bench) -> None:
         old = self.entry(bench, "a_msgs", MONTH_S)
-        old.note_use()
+        old.record_use()
 
         sweep(old.folder.parent)
 

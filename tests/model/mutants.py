@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ import neuros.launcher.quiescence as quiescence
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
 from neuros.engine.input_queue import InputQueue, Subscription
-from neuros.engine.schedule import Lifecycle, Schedule
+from neuros.engine.schedule import FIRST_TURN, Lifecycle, Schedule
 from neuros.engine.send_window import SendWindow
 from neuros.project.model import Connection
 
@@ -33,6 +33,7 @@ class Mutant:
 _begin_if_registered = Lifecycle._begin_if_registered
 _start = Lifecycle.start
 _subscription = Subscription.__init__
+_put = Subscription.put
 
 
 def _begin_at_once(lifecycle: Lifecycle) -> None:
@@ -48,8 +49,10 @@ def _spend_without_window(window: SendWindow, now_ns: int) -> None:
     window.sent += 1
 
 
-def _last_received(subscription: Subscription, queue: InputQueue | None = None) -> int:
-    return subscription.received
+def _acknowledges_on_arrival(subscription: Subscription, arrival: int, packet: Any) -> None:
+    _put(subscription, arrival, packet)
+    if subscription.is_acknowledged:
+        subscription.acknowledge(subscription.received)
 
 
 def _position_of_the_first(subscription: Subscription, queue: InputQueue | None = None) -> int:
@@ -61,8 +64,10 @@ def _holds_one(subscription: Subscription, *arguments: Any, **options: Any) -> N
     subscription.capacity = 1
 
 
-def _last_executed(schedule: Schedule) -> Iterator[Hook]:
-    yield max(schedule.candidates, key=lambda hook: hook.turn)
+def _stay_first(schedule: Schedule, hook: Hook) -> None:
+    for other in schedule.order:
+        other.turn = schedule.last_turn + 1  # behind each pass
+    hook.turn = FIRST_TURN
 
 
 MUTANTS: Sequence[Mutant] = (
@@ -84,7 +89,7 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "a packet is acknowledged when a hook starts on it, and not before",
         "a longer queue for a slow taker",
-        lambda: patch.object(Subscription, "position_if_consumed", _last_received),
+        lambda: patch.object(Subscription, "put", _acknowledges_on_arrival),
     ),
     Mutant(
         "a packet is acknowledged when every taker has started on it",
@@ -111,7 +116,7 @@ MUTANTS: Sequence[Mutant] = (
     Mutant(
         "the hook that was least recently executed comes first",
         "two hooks of which one never rests",
-        lambda: patch.object(Schedule, "one_pass", _last_executed),
+        lambda: patch.object(Schedule, "move_to_end", _stay_first),
     ),
     Mutant(
         "hooks that send unasked stop when the end is drained",

@@ -30,7 +30,7 @@ _WITHOUT_EFFECT = frozenset(
         *("_clock", "clock", "created_ns", "since_ns", "spent_ns", "busy_ns", "tick_start_ns"),
         *("taken_ns", "sent_ns", "acknowledged_ns", "due_ns", "missed_ticks", "ticks"),
         *("execution_log", "executions", "taken", "longest_discard", "discards_in_a_row"),
-        *("executing", "_cause", "rest", "_turn", "_first_turn", "_arrivals"),
+        *("executing", "_cause", "rest", "last_turn", "new_turn", "_arrivals"),
         # There is one round of probes at a time.
         "world",
         *("_asked_s", "_pause_s", "_number", "candidates", "connections", "_connections"),

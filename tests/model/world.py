@@ -312,7 +312,7 @@ class World:
 
     def _probe(self) -> None:
         self.now_s += 1e3  # long after the last one
-        self.probing.look(self.now_s, 0.0)
+        self.probing.check(self.now_s, 0.0)
 
     # the launcher
 
@@ -364,7 +364,7 @@ class World:
 
     def take_answer(self, answer: Probed) -> None:
         """A node has answered a probe."""
-        self.probing.take(answer)
+        self.probing.add(answer)
         if self.probing.verdict is Verdict.DRAINED and not self.is_drained:
             self._end_drained()
 

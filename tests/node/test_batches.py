@@ -31,7 +31,7 @@ def asked(wanted: dict[str, Any], *packets: Any) -> dict[str, Any]:
     sampler = Sampler()
     sampler.ask({"out": wanted})
     for packet in packets:
-        sampler.note("out", packet)
+        sampler.sample("out", packet)
     return dict(sampler.ask({}).get("out", {}))
 
 
@@ -61,11 +61,11 @@ def test_after_a_page_was_left_packets_are_looked_at_no_longer() -> None:
     sampler = Sampler()
     sampler.ask({"out": {"spikes": True}})
     for _ in range(MOST_PACKETS):
-        sampler.note("out", spikes([], []))
+        sampler.sample("out", spikes([], []))
     assert not sampler.requests
     sampler.ask({"out": {"arrays": ["data"]}})
     for _ in range(MOST_ARRAYS):
-        sampler.note("out", String())
+        sampler.sample("out", String())
     assert not sampler.requests
 
 

@@ -1,4 +1,4 @@
-"""The thread of a node process that obeys the supervisor."""
+"""The thread of a node process that handles messages of the supervisor."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ class Process:
     """Notes what it is asked for."""
 
     def __init__(self) -> None:
-        self.obeyed: list[Message] = []
+        self.handled: list[Message] = []
         self.events: list[Callable[[], None]] = []
-        self.is_let_go = False
+        self.is_alone = False
 
-    def obey(self, message: Message) -> None:
-        self.obeyed.append(message)
+    def handle(self, message: Message) -> None:
+        self.handled.append(message)
 
     def post(self, event: Callable[[], None]) -> None:
         self.events.append(event)
 
-    def let_go(self) -> None:
-        self.is_let_go = True
+    def on_supervisor_gone(self) -> None:
+        self.is_alone = True
 
 
 def run(sent: bytes) -> Any:
@@ -48,10 +48,10 @@ def run(sent: bytes) -> Any:
     return process
 
 
-def test_messages_are_obeyed_in_their_order_until_the_supervisor_hangs_up() -> None:
+def test_messages_are_handled_in_their_order_until_the_supervisor_hangs_up() -> None:
     process = run(encode(Pause()) + encode(Probe(3)))
-    assert process.obeyed == [Pause(), Probe(3)]
-    assert process.is_let_go
+    assert process.handled == [Pause(), Probe(3)]
+    assert process.is_alone
 
 
 def test_what_is_not_understood_fails_in_the_loop() -> None:

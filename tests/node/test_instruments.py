@@ -9,7 +9,7 @@ import pytest
 from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Int32
 
-from neuros.node.instruments import NodeRecorder, Tap
+from neuros.node.instruments import NodeRecorder, Passage
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import CLOCK_TYPE, SimulatedTime
 from neuros.ports import Way
@@ -39,29 +39,29 @@ class Kept:
         self.is_closed = True
 
 
-def show(tap: Tap, packet: Any, data: bytes | None = None) -> None:
-    for observe in tap.observers:
+def show(passage: Passage, packet: Any, data: bytes | None = None) -> None:
+    for observe in passage.observers:
         observe(packet, data)
 
 
 @pytest.mark.parametrize("way", [Way.SENT, Way.TO_ITSELF])
 def test_the_sampler_is_on_a_tap_only_while_it_is_asked(way: Way) -> None:
-    sampler, tap = Sampler(), Tap(way, NUMBER)
-    sampler.attach(tap)
-    assert not tap.observers
+    sampler, passage = Sampler(), Passage(way, NUMBER)
+    sampler.attach(passage)
+    assert not passage.observers
     sampler.ask({"other": {"all": True}})
-    assert not tap.observers
+    assert not passage.observers
     sampler.ask({"number": {"all": True}})
-    show(tap, Int32(data=5))
+    show(passage, Int32(data=5))
     assert sampler.ask({})["number"]["all"] == {"data": 5}
-    assert not tap.observers
+    assert not passage.observers
 
 
 def test_the_sampler_knows_an_external_input_by_its_topic() -> None:
-    sampler, tap = Sampler(), Tap(Way.HEARD, Port("scan", NUMBER.type, "/laser"))
-    sampler.attach(tap)
+    sampler, passage = Sampler(), Passage(Way.HEARD, Port("scan", NUMBER.type, "/laser"))
+    sampler.attach(passage)
     sampler.ask({"/laser": {"all": True}})
-    show(tap, Int32(data=6))
+    show(passage, Int32(data=6))
     assert sampler.ask({})["/laser"]["all"] == {"data": 6}
 
 
@@ -73,12 +73,13 @@ def test_the_recorder_is_on_the_taps_that_are_recorded_and_encodes_once() -> Non
         lambda: 1.5,
         LocalLogger("a", lambda _, record: records.append(record)),
     )
-    taps = [Tap(Way.SENT, NUMBER), Tap(Way.SENT, CLOCK), Tap(Way.RECEIVED, NUMBER, CONNECTION)]
-    for tap in taps:
-        recorder.attach(tap)
-    assert [len(tap.observers) for tap in taps] == [1, 0, 0]
-    show(taps[0], Int32(), b"published")
-    show(taps[0], Int32())
+    ways = (Way.SENT, NUMBER), (Way.SENT, CLOCK), (Way.RECEIVED, NUMBER, CONNECTION)
+    passages = [Passage(*way) for way in ways]
+    for passage in passages:
+        recorder.attach(passage)
+    assert [len(passage.observers) for passage in passages] == [1, 0, 0]
+    show(passages[0], Int32(), b"published")
+    show(passages[0], Int32())
     assert kept.packets == [(7, b"published", 1.5), (7, b"made", 1.5)]
 
 
@@ -90,11 +91,11 @@ def test_a_recorder_that_fails_says_so_once_and_the_node_goes_on() -> None:
         lambda: None,
         LocalLogger("a", lambda _, record: records.append(record)),
     )
-    tap = Tap(Way.SENT, NUMBER)
-    recorder.attach(tap)
+    passage = Passage(Way.SENT, NUMBER)
+    recorder.attach(passage)
     kept.is_full = True
-    show(tap, Int32())
-    show(tap, Int32())
+    show(passage, Int32())
+    show(passage, Int32())
     assert kept.is_closed
     (record,) = records
     assert "No space left on device; the run goes on" in record.text
@@ -103,14 +104,14 @@ def test_a_recorder_that_fails_says_so_once_and_the_node_goes_on() -> None:
 def test_the_clock_is_taken_from_outputs_of_its_type_unless_a_simulator_owns_the_time() -> None:
     node = Node("a", "neuros_python", Path("plugin.py"), outputs=(NUMBER, CLOCK))
     time = SimulatedTime(node, None, lambda: 0, lambda _: None)
-    taps = {port: Tap(Way.SENT, port) for port in node.outputs}
-    for tap in taps.values():
-        time.attach(tap)
-    assert not taps[NUMBER].observers
+    passages = {port: Passage(Way.SENT, port) for port in node.outputs}
+    for passage in passages.values():
+        time.attach(passage)
+    assert not passages[NUMBER].observers
     packet = Clock()
     packet.clock.sec = 3
-    show(taps[CLOCK], packet)
+    show(passages[CLOCK], packet)
     assert time.now_s == 3.0
     time.own(lambda: 8.0)
-    show(taps[CLOCK], packet)
+    show(passages[CLOCK], packet)
     assert time.now_s == 8.0

@@ -13,7 +13,7 @@ from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import Bool, Float64MultiArray
 
 from neuros.control import WORLD
-from neuros.node.instruments import Tap
+from neuros.node.instruments import Passage
 from neuros.node.sampling import (
     MOST_ELEMENTS,
     MOST_VALUES,
@@ -35,7 +35,7 @@ def imu(z: float) -> Imu:
 def test_what_nobody_asks_for_is_not_looked_at() -> None:
     sampler = Sampler()
     assert not sampler.requests
-    sampler.note("imu", object())
+    sampler.sample("imu", object())
     assert sampler.ask({}) == {}
 
 
@@ -59,8 +59,8 @@ def test_chosen_fields_are_read_of_each_packet_up_to_a_limit() -> None:
     wanted = {"imu": {"fields": ["angular_velocity.z", "angular_velocity.w"]}}
     sampler.ask(wanted)
     for number in range(MOST_VALUES + 5):
-        sampler.note("imu", imu(number))
-        sampler.note("other", object())
+        sampler.sample("imu", imu(number))
+        sampler.sample("other", object())
     assert not sampler.requests  # from here on a packet costs nothing
     sample = sampler.ask(wanted)["imu"]
     assert sample["fields"] == wanted["imu"]["fields"]
@@ -74,9 +74,9 @@ def test_chosen_fields_are_read_of_each_packet_up_to_a_limit() -> None:
 def test_each_observer_gets_what_it_asked_for() -> None:
     sampler = Sampler()
     sampler.ask({"imu": {"fields": ["angular_velocity.z"]}}, asker=1)
-    sampler.note("imu", imu(1.0))
+    sampler.sample("imu", imu(1.0))
     sampler.ask({"imu": {"all": True}, "camera": {"image": True}}, asker=2)
-    sampler.note("imu", imu(2.0))
+    sampler.sample("imu", imu(2.0))
     assert [row[1] for row in sampler.ask({}, asker=1)["imu"]["values"]] == [1.0, 2.0]
     answers = sampler.ask({}, asker=2)
     assert list(answers) == ["imu"]
@@ -94,8 +94,8 @@ def test_a_question_that_comes_while_a_packet_is_looked_at_counts_from_the_next_
     sampler = Sampler()
     sampler.ask({"imu": {"all": True, "fields": ["z"]}})
     for _ in range(MOST_VALUES - 1):
-        sampler.note("imu", Imu())
-    sampler.note("imu", Asking())
+        sampler.sample("imu", Imu())
+    sampler.sample("imu", Asking())
     assert list(sampler.requests) == ["camera"]
 
 
@@ -103,7 +103,7 @@ def test_of_all_fields_and_of_images_one_packet_is_enough() -> None:
     sampler = Sampler()
     image = Image(width=2, height=1, step=2, encoding="mono8", data=array("B", b"\x01\x02"))
     sampler.ask({"camera": {"all": True, "image": True}})
-    sampler.note("camera", image)
+    sampler.sample("camera", image)
     image.data[0] = 9  # the sender's again: what was sampled is a copy
     assert not sampler.requests
     sample = sampler.ask({})["camera"]
@@ -113,11 +113,11 @@ def test_of_all_fields_and_of_images_one_packet_is_enough() -> None:
 
 def test_an_array_is_looked_at_as_the_message_that_ros_sees() -> None:
     sampler = Sampler()
-    tap = Tap(Way.SENT, Port("state", "float64[2,3]"))
-    sampler.attach(tap)
+    passage = Passage(Way.SENT, Port("state", "float64[2,3]"))
+    sampler.attach(passage)
     sampler.ask({"state": {"all": True, "fields": ["data[4]"], "arrays": ["data"]}})
     packet = np.arange(6.0).reshape(2, 3)
-    for observe in tap.observers:
+    for observe in passage.observers:
         observe(packet, None)
     packet[:] = 0  # the sender's again
     sample = sampler.ask({})["state"]
@@ -129,7 +129,7 @@ def test_an_array_is_looked_at_as_the_message_that_ros_sees() -> None:
 def test_what_cannot_be_read_is_told_and_harms_nobody() -> None:
     sampler = Sampler()
     sampler.ask({"camera": {"image": True}})
-    sampler.note("camera", Image(encoding="yuv422"))
+    sampler.sample("camera", Image(encoding="yuv422"))
     assert "encoding 'yuv422' are not shown" in sampler.ask({})["camera"]["fault"]
 
 
@@ -137,7 +137,7 @@ def test_what_cannot_be_read_is_told_and_harms_nobody() -> None:
 def test_an_image_without_pixels_is_told(width: int, height: int) -> None:
     sampler = Sampler()
     sampler.ask({"camera": {"image": True}})
-    sampler.note("camera", Image(width=width, height=height, step=4 * width, encoding="rgba8"))
+    sampler.sample("camera", Image(width=width, height=height, step=4 * width, encoding="rgba8"))
     assert f"are not an image of {width} x {height}" in sampler.ask({})["camera"]["fault"]
 
 

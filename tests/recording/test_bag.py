@@ -290,12 +290,12 @@ def lay_out(folder: Path, *files: str) -> None:
     ("path", "said", "exit_code"),
     [
         ("nowhere", "nowhere: there is no such file or folder", 2),
-        ("loose/a.mcap", "loose/a.mcap is a file: give the folder of a run, or of a bag", 2),
-        ("loose", "loose has a.mcap, but no metadata.yaml: `ros2 bag reindex` writes it anew", 2),
+        ("loose/a.mcap", "loose/a.mcap is no bag: it begins neither as MCAP nor as SQLite", 2),
+        ("loose", "loose/a.mcap is no bag: it begins neither as MCAP nor as SQLite", 2),
         ("empty", "empty is the folder of neither a run nor a bag: it has no run.json, no meta", 2),
         ("run", "run was not recorded: launch the project with -r, or name topics with -t", 2),
         ("killed", "killed was not recorded: launch the project with -r, or name topics", 2),
-        ("torn", "torn cannot be read: it is damaged (Could not load YAML from ", 4),
+        ("torn", "torn cannot be read: it is damaged (metadata.yaml is no YAML: ", 4),
     ],
 )
 def test_a_path_without_a_bag_gets_one_sentence(

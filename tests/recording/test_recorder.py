@@ -400,31 +400,6 @@ def test_other_files_in_a_spool_are_left_alone(tmp_path: Path, name: str) -> Non
     assert repair(tmp_path, fail) is None
 
 
-@pytest.mark.parametrize("name", ["a", "a/spool", "a/spool/00000001"])
-def test_a_link_in_the_place_of_a_spool_is_named_and_costs_nothing(
-    tmp_path: Path, name: str
-) -> None:
-    plan().save(tmp_path)
-    spool(tmp_path, "a", [(10, None, number(7))])
-    spool(tmp_path, "b", [(20, None, answer())])
-    link, former = tmp_path / name, tmp_path / "former"
-    if link.exists():
-        link.rename(former)
-    link.symlink_to(tmp_path)
-    told: list[str] = []
-    repaired = repair(tmp_path, told.append)
-    assert repaired is not None
-    assert repaired.counts["/answer"] == 1
-    (text,) = told
-    assert text.startswith(f"{link}: ")
-    assert text.endswith(f": packets in {tmp_path}/a/spool are not recorded, and it is kept")
-    link.unlink()
-    if former.exists():
-        former.rename(link)
-    counts = counts_after_repair(tmp_path)
-    assert (counts["/neuros/a/number/b/number/data"], counts["/answer"]) == (1, 1)
-
-
 def test_a_list_of_topics_that_is_damaged_in_a_run_costs_nothing(tmp_path: Path) -> None:
     spool(tmp_path, "a", [(10, None, number(7))])
     listened = ListenedSpool(tmp_path)

@@ -197,7 +197,7 @@ def test_a_reader_sees_whether_somebody_may_still_write(tmp_path: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_an_os_error(tmp_path: Path) -> None:
     (tmp_path / "spool").write_text("in the way")
-    with pytest.raises(NotADirectoryError, match="spool"):
+    with pytest.raises(FileExistsError, match="spool"):
         writer(tmp_path).keep(IMU, b"a", None)
 
 

@@ -30,7 +30,7 @@ def write_package(
     rows = "".join(f"  <depend>{each}</depend>\n" for each in depends)
     (folder / "package.xml").write_text(MANIFEST.format(name=name, depends=rows))
     for path, text in files.items():
-        (folder / path).parent.mkdir(exist_ok=True)
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / path).write_text(text)
     return folder
 

@@ -15,6 +15,7 @@ def start(node):
 @neuros_function(outputs=[Optional("imu"), Optional("pose")])
 def simulate(node):
     robot = node.get_user_data()
+    robot.turn()
     robot.sim.step_to_next()
     if robot.is_done:
         robot.end(node)

@@ -21,5 +21,6 @@ def start(node):
 @neuros_tick(seconds=0.01)
 def watch_the_time(node):
     robot = node.get_user_data()
+    robot.turn()
     if robot.is_done:
         robot.end(node)

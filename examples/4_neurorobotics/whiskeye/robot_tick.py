@@ -20,6 +20,7 @@ def start(node):
 )
 def simulate(node):
     robot = node.get_user_data()
+    robot.turn()
     robot.sim.step_synchronous(round(STEP_SECONDS / robot.sim.timestep))
     if robot.is_done:
         robot.end(node)

@@ -18,10 +18,13 @@ class GyroIntegrator:
     The network simulates one window per packet. What went by before that window, while it was busy,
     is bridged by the turn that the same gyroscope tells. If it were simulated, each packet
     would take longer than the one before it wherever the robot is the faster one.
+
+    Without bridges, what went by is lost angle: then the error shows what losses cost the network.
     """
 
-    def __init__(self, network, bias_rad_s=0.0):
+    def __init__(self, network, bias_rad_s=0.0, *, bridges=True):
         self.network = network
+        self._bridges = bridges
         self._bias_rad_s = bias_rad_s
         self._quantum_ns = round(network.quantum_s * 1e9)
         self._done_ns = 0  # the network was settled for the start of simulated time
@@ -32,7 +35,7 @@ class GyroIntegrator:
         rate_rad_s += self._bias_rad_s
         missed_ns = max(0, (stamp_ns - self._done_ns) // WINDOW_NS - 1) * WINDOW_NS
         self.bridged_s += missed_ns * 1e-9
-        self.bridged_rad += rate_rad_s * missed_ns * 1e-9
+        self.bridged_rad += rate_rad_s * missed_ns * 1e-9 * self._bridges
         self._done_ns += missed_ns
         quanta = (stamp_ns - self._done_ns) // self._quantum_ns  # the rest is for the next packet
         if quanta > 0:
@@ -47,7 +50,8 @@ def start(node):
     network = HeadDirectionNetwork(seed=int(os.environ.get("SEED", "1")))
     network.settle()
     bias_rad_s = float(os.environ.get("GYRO_BIAS", "0"))
-    node.set_user_data(GyroIntegrator(network, bias_rad_s))
+    bridges = os.environ.get("BRIDGE", "1") != "0"
+    node.set_user_data(GyroIntegrator(network, bias_rad_s, bridges=bridges))
 
 
 @neuros_function(inputs="imu", outputs="estimate")

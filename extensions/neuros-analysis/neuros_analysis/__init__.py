@@ -1,4 +1,4 @@
-"""Reports, charts and comparisons of runs, frames of recorded packets, and sweeps of many runs."""
+"""Reports, timing and comparisons of runs, frames of recorded packets, and sweeps."""
 
 from neuros.ports import Subcommand
 
@@ -6,6 +6,10 @@ REPORT = Subcommand(
     "neuros_analysis.command", "say what limited the speed of a run, and draw figures"
 )
 COMPARE = Subcommand("neuros_analysis.command", "show the numbers of several runs side by side")
+TIMING = Subcommand(
+    "neuros_analysis.timing_command",
+    "measure durations of hooks and delays of connections in a run",
+)
 SWEEP = Subcommand(
     "neuros_analysis.command", "run a project with many values and seeds, and make one table"
 )

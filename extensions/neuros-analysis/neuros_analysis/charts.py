@@ -11,7 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch, Patch
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodFormatter
 
 from neuros.api.packets import Numbers
 from neuros.engine.metrics import TimeBudget
@@ -508,6 +508,41 @@ def comparison_figure(runs: Sequence[ReviewedRun]) -> Any | None:
         axes.set_title(title, fontsize=10, loc="left")
         axes.margins(x=0.1)
         axes.grid(visible=False, axis="y")
+    handles, labels = all_axes[0].get_legend_handles_labels()
+    add_legend(figure, 4, handles=handles, labels=labels)
+    return figure
+
+
+_PANEL_COLUMNS = 3
+
+
+def distributions_figure(panels: Mapping[str, Mapping[str, Numbers]]) -> Any:
+    """Cumulative shares of durations or delays, a panel for each hook or connection.
+
+    Args:
+        panels: by title, and by the label of the curve: seconds, (n,). All panels have the same
+            labels in the same order.
+    """
+    rows = -(-len(panels) // _PANEL_COLUMNS)
+    figure = new_figure(2.2 * max(1, rows) + 0.4)
+    all_axes = figure.subplots(max(1, rows), _PANEL_COLUMNS, squeeze=False).ravel()
+    for axes in all_axes[len(panels) :]:
+        axes.set_axis_off()
+    for axes, (title, curves) in zip(all_axes, panels.items(), strict=False):
+        for place, (label, values_s) in enumerate(curves.items()):
+            shares = np.linspace(0, 100, min(_POINTS, len(values_s) + 1))
+            ms = np.maximum(np.percentile(values_s, shares) * 1e3, 1e-3)
+            axes.plot(ms, shares, ("-", "--")[place % 2], color=colour(place), label=label)
+        plain(axes).set_xscale("log")
+        low, high = axes.get_xlim()
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 200 * low else (1,)))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.set_ylim(0, 100)
+        axes.set_title(title, fontsize=7.5, loc="left")
+        axes.set_xlabel("ms", fontsize=7)
+        axes.set_ylabel("share / %", fontsize=7)
+        axes.tick_params(labelsize=7)
     handles, labels = all_axes[0].get_legend_handles_labels()
     add_legend(figure, 4, handles=handles, labels=labels)
     return figure

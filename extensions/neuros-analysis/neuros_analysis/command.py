@@ -37,9 +37,13 @@ def add_report(report: argparse.ArgumentParser) -> None:
         "Say what limited the speed of a run, and write a page (HTML, one file) with figures, and"
         " the figures themselves (PNG)."
     )
-    report.add_argument("run", metavar="RUN", type=Path, help="a run folder")
+    report.add_argument("run", metavar="RUN", type=Path, help="a run folder, or a bag")
     report.add_argument(
-        "-o", "--output", type=Path, metavar="DIR", help="where to write (default: RUN/report)"
+        "-o",
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="where to write (default: RUN/report; of a bag, BAG_report in the current folder)",
     )
     report.set_defaults(command=_report)
 
@@ -59,10 +63,13 @@ def add_compare(compare: argparse.ArgumentParser) -> None:
 
 
 def _report(options: argparse.Namespace) -> int:
+    from neuros_analysis.bag_pages import is_foreign_bag
     from neuros_analysis.findings import findings_of
     from neuros_analysis.review import open_for_review
     from neuros_analysis.run_pages import figures_of, panels_page, report_page, world_pages
 
+    if is_foreign_bag(options.run):
+        return _report_bag(options)
     run = open_for_review(options.run)
     folder = options.output or options.run / "report"
     if options.output is None and folder.is_symlink():
@@ -87,7 +94,7 @@ def _report(options: argparse.Namespace) -> int:
         print(f"missing: panels: {fault}")
     pages = {} if panels is None else {"panels.html": panels.encode()}
     whole = {**files, _PAGE: text.encode(), **worlds, **pages}
-    with _writing(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
         for name, data in whole.items():
             write_whole(folder / name, data)
@@ -96,6 +103,33 @@ def _report(options: argparse.Namespace) -> int:
         print(f"{folder / name}: the world in 3-D")
     for name in pages:
         print(f"{folder / name}: spikes and activity")
+    return 0
+
+
+def _report_bag(options: argparse.Namespace) -> int:
+    """Write the page of a bag of another program."""
+    from tabulate import tabulate
+
+    from neuros.bag import open_bag
+    from neuros_analysis.bag_pages import HEADER, bag_page, times_of
+    from neuros_analysis.run_pages import panels_of
+
+    folder = options.output or Path(f"{options.run.resolve().name}_report")
+    with open_bag(options.run) as bag:
+        topics = times_of(bag)
+        pages = {_PAGE: bag_page(bag, topics)}
+        if panels := panels_of(bag, bag.folder.name):
+            pages["panels.html"] = panels
+        notes = [*bag.notes, *(topic.remark for topic in topics if topic.remark)]
+    print(tabulate([topic.row for topic in topics], HEADER, disable_numparse=True))
+    for note in notes:
+        print(f"note: {note}")
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in pages.items():
+            write_whole(folder / name, text.encode())
+    for name in pages:
+        print(folder / name)
     return 0
 
 
@@ -124,7 +158,7 @@ def _compare(options: argparse.Namespace) -> int:
                 print(f"missing in {label}: {line}")
     if options.output is not None:
         page = _comparison_page(runs, header, rows)
-        with _writing(options.output.parent):
+        with writing(options.output.parent):
             options.output.parent.mkdir(parents=True, exist_ok=True)
             options.output.write_bytes(page)
         if not is_json:
@@ -138,7 +172,7 @@ def _comparison_page(runs: list[ReviewedRun], header: list[str], rows: list[list
     from neuros_analysis.charts import comparison_figure
     from neuros_analysis.comparison import labels_of
     from neuros_analysis.findings import findings_of
-    from neuros_analysis.run_pages import bottleneck_part, figure_part, page, png, table_part
+    from neuros_analysis.run_pages import bottleneck_part, figure_part, page, picture, table_part
 
     parts = [
         bottleneck_part(findings_of(run), f"The bottleneck of {label}")
@@ -146,13 +180,14 @@ def _comparison_page(runs: list[ReviewedRun], header: list[str], rows: list[list
     ]
     figure = comparison_figure(runs)
     if figure is not None:
-        parts.append(figure_part("Side by side", "", png(figure)))
+        parts.append(figure_part("Side by side", "", picture(figure)))
     parts.append(table_part("All figures", header, rows))
     return page("Comparison of runs", parts).encode()
 
 
 @contextlib.contextmanager
-def _writing(folder: Path) -> Iterator[None]:
+def writing(folder: Path) -> Iterator[None]:
+    """Turn what fails inside into a sentence. Raises ``EnvironmentFault``."""
     try:
         yield
     except OSError as error:

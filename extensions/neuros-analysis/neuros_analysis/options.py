@@ -1,4 +1,4 @@
-"""Options of ``neuros sweep``, which are arguments of ``neuros.sweep``, too."""
+"""Options of ``neuros sweep``, which are arguments of ``neuros.sweep``, too; fits of timing."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from neuros.registry import EXECUTORS
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
+
+FITS = ("samples", "lognormal", "normal", "constant")
+"""What a file of ``neuros timing`` has of each hook and connection."""
 
 OnRow: TypeAlias = "Callable[[int, int, Mapping[str, Any]], None]"
 
@@ -72,6 +75,7 @@ class SweepOptions:
     )
     backend: str | None = like(Request, "backend")
     duration: float | str | None = like(Request, "duration")
+    portable: bool | None = like(Request, "portable")
     record: bool | Sequence[str] = like(Request, "record", group="")
     output: str | os.PathLike[str] | None = option(
         "-o",

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from neuros.bag import RecordedTopic, open_bag
+from neuros.bag import Bag, RecordedTopic, open_bag
 from neuros.errors import UsageError
 from neuros.node.logs import WORLD_LOG
 from neuros.project.dashboard import ARRAYS, SPIKES
@@ -49,10 +49,10 @@ _PANELS_SCRIPTS = ("format.js", "plane.js", "spikes.js", "raster.js", "activity.
 _IMPORT = re.compile(r"^import .*$", re.MULTILINE)
 
 
-def png(figure: Any) -> bytes:
+def picture(figure: Any, kind: str = "png") -> bytes:
     """A figure as a file's content."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png")
+    figure.savefig(buffer, format=kind)
     return buffer.getvalue()
 
 
@@ -241,7 +241,7 @@ def figures_of(run: ReviewedRun) -> dict[str, tuple[str, str, bytes]]:
     for name, title, text, draw in _FIGURES:
         figure = draw(run)
         if figure is not None:
-            found[name] = (title, text, png(figure))
+            found[name] = (title, text, picture(figure))
     return found
 
 
@@ -256,13 +256,19 @@ def panels_page(run: ReviewedRun) -> str | None:
     except UsageError:  # it was not recorded
         return None
     with bag:
-        labels = [t.connection or t.name for t in bag.topics.values()]
-        outputs = dict.fromkeys(label.partition(" -> ")[0] for label in labels)
-        panels = [p for name in outputs for p in _panels(name, bag[name], bag.start_ns)]
+        return panels_of(bag, run.name)
+
+
+def panels_of(bag: Bag, name: str) -> str | None:
+    """As :func:`panels_page`, of a bag; ``name``: for the heading."""
+    panels: list[dict[str, Any]] = []
+    labels = [t.connection or t.name for t in bag.topics.values()]
+    for output in dict.fromkeys(label.partition(" -> ")[0] for label in labels):
+        panels += _panels(output, bag[output], bag.start_ns)
     if not panels:
         return None
     scripts = (_IMPORT.sub("", (_SCRIPTS / name).read_text("utf-8")) for name in _PANELS_SCRIPTS)
-    title = f"Activity in {run.name}"
+    title = f"Activity in {name}"
     return _filled("panels_page.html", title, scripts="\n".join(scripts), panels=_in_script(panels))
 
 

@@ -42,7 +42,7 @@ _STOP_NAME = ".sweep.stop"  # exists from the interruption of a sweep until its 
 CSV_NAME = "sweep.csv"
 _WAIT_S = 1.0
 _PAUSE_PER_WRITING = 100.0  # writing the table uses at most 1 % of a core, however long it is
-_OF_EACH_RUN = ("backend", "duration", "record")
+_OF_EACH_RUN = ("backend", "duration", "portable", "record")
 _REASON_CHARACTERS = 50
 _COUNTS = (": sent", ": consumed")
 _MOST_CHARACTERS = 80
@@ -123,7 +123,7 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
     points = points_of(values, [int(seed) for seed in options.seeds], options.repeat)
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"jobs {options.jobs}: give 1 or more")
-    request = Request(backend=options.backend, duration=options.duration, record=options.record)
+    request = Request(**{name: getattr(options, name) for name in _OF_EACH_RUN})
     if (back_end := request.backend or AUTO) != AUTO:
         BACK_ENDS.load(back_end)  # raises here once, not in each run
     resources = _check_all(project, points, request)

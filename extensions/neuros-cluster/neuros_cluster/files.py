@@ -34,7 +34,6 @@ from msgspec.structs import asdict
 
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.errors import EnvironmentFault
-from neuros.ordinary_files import folder_in, open_log
 from neuros_cluster.messages import Chunk, Tree, TreeFile
 
 RECEIVED, RUNS = "received", "runs"
@@ -268,13 +267,9 @@ def write_chunk(run: Path, chunk: Chunk) -> int:
     path = Path(os.path.normpath(run / chunk.path))
     if path == run or not path.is_relative_to(run):
         raise OSError(f"{chunk.path} is outside of the run folder")
-    folders = path.relative_to(run).parent.parts
     try:
-        run.mkdir(parents=True, exist_ok=True)
-        with (
-            folder_in(run, *folders, makes=True) as folder,
-            open_log(folder / path.name) as file,
-        ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("ab") as file:
             file.truncate(chunk.offset)  # the file is open for appending
             file.write(chunk.data)
     except (ValueError, OverflowError) as error:  # neither a path nor an offset

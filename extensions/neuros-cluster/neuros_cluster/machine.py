@@ -381,6 +381,7 @@ _TIMES: Mapping[str, tuple[int, tuple[int, ...]]] = {
     "taken_ns": (1, (0,)),
     "executions": (3, (1, 2)),
     "credits": (3, (2,)),
+    "pauses": (2, (0, 1)),
 }
 
 

@@ -38,7 +38,7 @@ held, goes_on, *command = sys.argv[1:]
 agent = subprocess.Popen(command, stdout=subprocess.PIPE)
 for length in iter(lambda: agent.stdout.read(4), b""):
     message = length + agent.stdout.read(int.from_bytes(length, "little"))
-    if b"kind\\xa6loaded" in message:
+    if b"kind\\xa5hooks" in message:
         open(held, "w").close()
         while not os.path.exists(goes_on):
             time.sleep(0.01)

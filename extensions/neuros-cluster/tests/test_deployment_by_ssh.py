@@ -30,7 +30,7 @@ from containers import wait_until
 from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses
 from neuros.backends.sessions import RunOnThisMachine, sessions
-from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, Watch
+from neuros.control import TO_OBSERVERS, GetStatus, NodeStatus, Watch
 from neuros.control.link import ControlLink
 
 STREAM = Path(__file__).parents[3] / "tests/integration/network/stream"
@@ -364,7 +364,7 @@ def test_an_observer_sees_the_nodes_there_on_the_clock_of_this_machine(at_work: 
     (here,) = (s for s in sessions() if s.launcher[0] == at_work.running.process.pid)
     link = ControlLink(connect(here.control), TO_OBSERVERS, "the supervisor")
     link.send(Watch())
-    link.send(LookAll({"sink": {"image": {"fields": ["height"]}}}))
+    link.send(GetStatus({"sink": {"image": {"fields": ["height"]}}}))
     deadline_s = time.monotonic() + UP_S
     status = None
     while status is None and time.monotonic() < deadline_s:

@@ -17,8 +17,8 @@ from typing import Any, TypeAlias
 from neuros.control import (
     WORLD,
     Ended,
+    GetStatus,
     LogRecord,
-    LookAll,
     Message,
     NodeStatus,
     PhaseChanged,
@@ -361,7 +361,7 @@ class ObservedRun:
             wanted = self._pages.wanted()
             for node in self._geometries:
                 wanted.setdefault(node, {}).setdefault(WORLD, {})["geometry"] = True
-            self.send(LookAll(wanted))
+            self.send(GetStatus(wanted))
             # A node whose hook holds Python's global lock answers late: do not wait for it.
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._has_answered.wait(), _PATIENCE_S)

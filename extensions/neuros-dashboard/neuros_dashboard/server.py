@@ -43,7 +43,7 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Receive, Scope, Send
 
-from neuros.control import End, Message, Pause, Resume, StepAll
+from neuros.control import End, Message, Pause, Resume, Step
 from neuros_dashboard.live_metrics import ObservedRun
 from neuros_dashboard.pages import Pages, wanted_of
 
@@ -186,7 +186,7 @@ class Dashboard:
                 count = int((await request.json())["count"])
             except _NOT_UNDERSTOOD:
                 return JSONResponse({"error": "how many steps?"}, 400)
-            self._run.send(StepAll(min(count, _MOST_STEPS)))
+            self._run.send(Step(min(count, _MOST_STEPS)))
         else:
             return JSONResponse({"error": f"nothing is called '{what}'"}, 404)
         return Response(status_code=204)

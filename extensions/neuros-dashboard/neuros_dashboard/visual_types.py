@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from neuros.control import LookAll, NodeStatus, Watch
+from neuros.control import GetStatus, NodeStatus, Watch
 from neuros.control.link import ControlLink
 from neuros.project.dashboard import IMAGES
 
@@ -197,7 +197,7 @@ def observe(
                 wanted: dict[str, dict[str, Any]] = {}
                 for node, port, source in sources.values():
                     wanted.setdefault(node, {})[port] = source.wanted()
-                link.send(LookAll(wanted))
+                link.send(GetStatus(wanted))
             if not select.select([link], [], [], max(0.0, next_s - now_s))[0]:
                 continue
             messages = link.receive()

@@ -9,7 +9,7 @@ from pathlib import Path
 from neuros_dashboard.visual_types import Mark, Numbers, VisualTypes, observe
 
 from neuros.backends.control_sockets import UnixListener, connect
-from neuros.control import TO_OBSERVERS, LookAll, NodeStatus, PhaseChanged, Watch
+from neuros.control import TO_OBSERVERS, GetStatus, NodeStatus, PhaseChanged, Watch
 from neuros.control.link import ControlLink
 from neuros.launcher.channels import Channels
 
@@ -29,7 +29,7 @@ def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:
         channels.wait(5.0)
         for lines, message in channels.receive():
             asked.append(type(message))
-            if isinstance(message, LookAll):
+            if isinstance(message, GetStatus):
                 fields = message.wanted["robot"]["imu"]["fields"]
                 sample = {"fields": fields, "values": [[1e9, *([0.5] * len(fields))]]}
                 channels.send_to(lines, PhaseChanged("running", False))
@@ -37,7 +37,7 @@ def test_what_nodes_sample_is_shown_under_its_name(tmp_path: Path) -> None:
     channels.close()
     observer.join(5.0)
     assert not observer.is_alive()
-    assert asked[:2] == [Watch, LookAll]
+    assert asked[:2] == [Watch, GetStatus]
     name, (_, numbers) = shown[0]
     assert name == "robot.imu"
     assert isinstance(numbers, Numbers)

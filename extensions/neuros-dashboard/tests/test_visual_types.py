@@ -19,7 +19,7 @@ def seen(source: VisualTypes, packet: Any) -> list[Mark]:
     """What is shown of a packet that a real node has sampled."""
     sampler = Sampler()
     sampler.ask({"o": source.wanted()})
-    sampler.note("o", packet)
+    sampler.sample("o", packet)
     return list(source.marks(sampler.ask({})["o"]))
 
 

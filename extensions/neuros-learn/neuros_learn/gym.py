@@ -30,7 +30,7 @@ from neuros.project.model import SEEDS, Port
 from neuros.project.model import Project as Described
 from neuros.project.suggest import did_you_mean
 from neuros.project.timing import seeds
-from neuros.transport.messages import message_class
+from neuros.transport.messages import factory_of, message_class
 from neuros.transport.schema import NUMBERS, Leaf, Shape, Sort, getter, schema
 from neuros.visualise import image_pixels
 
@@ -261,7 +261,7 @@ class _World:
                 self.session.send(end, message)
 
     def _observe(self) -> Any:
-        packets = {name: output.packet for name, output in self._outputs.items()}
+        packets = {name: output.shared_packet for name, output in self._outputs.items()}
         found = {each.name: each.read(packets[each.port]) for each in self._observations}
         return next(iter(found.values())) if self._has_one_observation else found
 
@@ -685,10 +685,10 @@ class _Numbers:
 
     def _resolve(self, port: Port, written: str, field: str, shape: tuple[int, ...] | None) -> bool:
         """Find the numbers, their type and their shape; whether all are truth values."""
-        self._kind = message_class(port.type)
-        leaves = _numbers_of(self._kind, field)
+        kind, self._make = message_class(port.type), factory_of(port.type)
+        leaves = _numbers_of(kind, field)
         if not leaves:
-            known = ", ".join(f"{self.port}.{_path(leaf)}" for leaf in _numbers_of(self._kind, ""))
+            known = ", ".join(f"{self.port}.{_path(leaf)}" for leaf in _numbers_of(kind, ""))
             raise UsageError(f"'{written}': there are no numbers of that name; there are {known}")
         # The size of a sequence without a bound is None.
         sizes = [1 if leaf.field.shape is Shape.SINGLE else leaf.field.size for leaf in leaves]
@@ -741,7 +741,7 @@ class _Numbers:
 
     def message(self, values: Any) -> Any:
         """A message with these numbers."""
-        flat, message, start = np.asarray(values).reshape(-1), self._kind(), 0
+        flat, message, start = np.asarray(values).reshape(-1), self._make(), 0
         if flat.size != sum(self._sizes):
             raise UsageError(f"{self.name} takes {sum(self._sizes)} numbers, not {flat.size}")
         for leaf, size in zip(self._leaves, self._sizes, strict=True):
@@ -767,20 +767,20 @@ class _ArrayNumbers(_Numbers):
             raise UsageError(
                 f"'{written}': its arrays have {array.size} numbers, not {prod(shape)}"
             )
-        self._array, self._shape = array, shape or array.shape
+        self._array, self._size, self._shape = array, array.size, shape or array.shape
         is_bool = array.dtype == "bool"
         self._dtype = np.dtype(np.uint8 if is_bool else array.dtype)
         return is_bool
 
     def read(self, message: Any) -> Any:
         """The numbers of an array."""
-        return np.array(message, self._dtype).reshape(self._shape)
+        return message.astype(self._dtype).reshape(self._shape)
 
     def message(self, values: Any) -> Any:
         """An array of these numbers; raises ``ValueError`` for one that does not fit."""
         given, is_float = np.asarray(values), self._dtype.kind == "f"
-        if given.size != self._array.size:
-            raise UsageError(f"{self.name} takes {self._array.size} numbers, not {given.size}")
+        if given.size != self._size:
+            raise UsageError(f"{self.name} takes {self._size} numbers, not {given.size}")
         given = given.reshape(self._array.shape)
         if given.dtype == self._array.dtype:
             return given
@@ -812,6 +812,7 @@ class _BatchNumbers(_ArrayNumbers):
         super().__init__(port, written, inputs, ranges, None)
         self._shape = (copies, *self._shape)
         self._array = self._array.of_copies(copies)
+        self._size = self._array.size
 
 
 _CONVERT: Mapping[Sort, Callable[[Any], list[Any]]] = {
@@ -863,6 +864,8 @@ def _by_names(role: str, function: Callable[..., Any]) -> Callable[[Mapping[str,
         ):
             hint = did_you_mean(each.name, _SEEN) or f"there are {', '.join(_SEEN)}"
             raise UsageError(f"{role}: there is nothing for its parameter '{each.name}' ({hint})")
+    if not names:
+        return lambda seen: function()
     return lambda seen: function(**{name: seen[name] for name in names})
 
 

@@ -1,4 +1,4 @@
-"""Bodies of SDF's links in MuJoCo, with their joints, and constraints and actuators of joints."""
+"""Bodies of links in MuJoCo, with their joints, and constraints and actuators of joints."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ import numpy as np
 
 from neuros_robots import links
 from neuros_robots.elements import Element
-from neuros_robots.frames import Branch, Joint, Scope, Vector, read_pose
+from neuros_robots.frames import Branch, Joint, Pose, Scope, Vector, read_pose
 from neuros_robots.mjcf import Building
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
-_BALL = mujoco.mjtJoint.mjJNT_BALL
+_BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
 _INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
 _TOLERANCE = 1e-9
 _NO_LIMIT = 1e15
 _UNLIMITED_ENDS = (-1e16, 1e16)
+_MOST_LINKS = 1000
 # By type of joint: MuJoCo's joints that make it up, each with the element of its axis.
 _PARTS: dict[str, tuple[tuple[Any, str], ...]] = {
     "revolute": ((_HINGE, "axis"),),
@@ -31,7 +32,18 @@ _PARTS: dict[str, tuple[tuple[Any, str], ...]] = {
     "gearbox": ((_HINGE, "axis"),),
     "ball": ((_BALL, ""),),
     "fixed": (),
+    # Those of URDF that SDF lacks; "carried" is a floating joint whose parent moves.
+    "floating": ((_FREE, ""),),
+    "carried": ((_SLIDE, "x"), (_SLIDE, "y"), (_SLIDE, "z"), (_BALL, "turn")),
+    "planar": ((_SLIDE, "x"), (_SLIDE, "y"), (_HINGE, "turn")),
+    "spherical": ((_BALL, ""),),  # Bullet's
 }
+URDF_TYPES = ("continuous", "fixed", "floating", "planar", "prismatic", "revolute", "spherical")
+SDF_TYPES = tuple(sorted({*_PARTS} - {"floating", "carried", "planar", "spherical"}))
+# What MuJoCo requires of a moving body without mass, which it then has beside all others.
+_LEAST_KG = _LEAST_KG_M2 = 1e-9
+_LEAST_GYRATION_M2 = 1e-6  # of a mass in one point: that of a ball of some millimetres
+_LOCKED = 1e-9, 2e-5  # absolute and relative width of an empty range; six digits show it
 _HALF_HINGE_M = 0.05
 _SOFT = "closes a loop: a soft constraint in MuJoCo, not a joint"
 _CONNECT = mujoco.mjtEq.mjEQ_CONNECT
@@ -40,7 +52,20 @@ _POSITION, _VELOCITY = "JointPositionController", "JointController"
 _STIFF_GAIN = 1000.0
 
 
-def add_body(building: Building, branch: Branch) -> None:
+def add_tree(building: Building, scope: Scope, branches: Sequence[Branch]) -> None:
+    """Add the bodies of links, with all that belongs to them, and what holds between them."""
+    for branch in branches:
+        _add_body(building, branch)
+    _give_least_masses(building, branches)
+    links.share_masks(building)
+    for branch in branches:
+        if branch.joint is not None:
+            links.add_joint_sensors(building, branch.link, branch.joint, is_turned=branch.is_turned)
+    _add_mimics(building, scope)
+    _exclude_contacts(building, scope)
+
+
+def _add_body(building: Building, branch: Branch) -> None:
     """Add the body of a link with its inertia, joints, shapes and sensors."""
     link, inertial = branch.link, branch.link.element.child("inertial")
     body = building.add("body", branch.parent, link.pose, link.name, link.element)
@@ -69,36 +94,97 @@ def _set_inertia(body: Any, link: Element, inertial: Element | None) -> None:
         link.remark("no <inertial>: it gets SDF's 1 kg, and 1 kg m² about each axis")
     else:
         pose = read_pose(inertial)
-        mass, centre = inertial.number("mass", 1.0, positive=True), pose.position
+        mass, centre = inertial.number("mass", 1.0), pose.position
+        if not 0 <= mass < math.inf:
+            (inertial.child("mass") or inertial).problem(f"must be a positive number, not {mass:g}")
         element = inertial.child("inertia") or inertial.made("inertia")
         ixx, iyy, izz, ixy, ixz, iyz = (element.number(*entry) for entry in _INERTIA.items())
         matrix = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-        matrix = pose.rotation @ _possible(matrix, element) @ pose.rotation.T
+        matrix = pose.rotation @ _possible(matrix, mass, element) @ pose.rotation.T
+    body.ipos = centre
+    _give(body, mass, matrix)
+
+
+def _give(body: Any, mass: float, matrix: Vector) -> None:
+    """Set mass and inertia; not as a full matrix, of which MuJoCo refuses moments below 1e-14."""
     body.explicitinertial = True
-    body.mass, body.ipos = mass, centre
-    body.fullinertia = [*np.diag(matrix), matrix[0, 1], matrix[0, 2], matrix[1, 2]]
+    body.mass = mass
+    moments, axes = np.linalg.eigh(matrix)
+    if np.count_nonzero(matrix - np.diag(np.diag(matrix))):
+        axes[:, 2] *= np.sign(np.linalg.det(axes))  # right-handed
+        body.inertia, body.iquat = moments, Pose(rotation=axes).quaternion
+    else:
+        body.inertia, body.iquat = np.diag(matrix), [1, 0, 0, 0]
 
 
-def _possible(matrix: Vector, element: Element) -> Vector:
+def _possible(matrix: Vector, mass: float, element: Element) -> Vector:
     """The matrix, or a replacement if no rigid body has this inertia."""
     if not np.isfinite(matrix).all():
         element.problem("every moment of inertia must be finite")
         return np.eye(3)
-    least, middle, most = np.linalg.eigvalsh(matrix)
-    if least <= 0:
+    if np.abs(matrix).max() < mujoco.mjMINVAL:  # rounded
+        matrix = np.zeros((3, 3))
+    moments, axes = np.linalg.eigh(matrix)
+    least, middle, most = moments
+    if np.diag(matrix).min() < 0 or most < 0:
         element.problem(
             f"no body has this inertia: its principal moments are {least:.3g}, {middle:.3g} and"
             f" {most:.3g} kg m², and each must be positive",
         )
         return np.eye(3)
-    if least + middle < most * (1 - _TOLERANCE):
-        mean = float(np.trace(matrix)) / 3
+    if least >= -_TOLERANCE * most and least + middle >= most * (1 - _TOLERANCE):
+        if least > _TOLERANCE * most or (not mass and not most):
+            return matrix
+        # A rod or a point, which MuJoCo takes with a little thickness only.
+        thin = min(mass * _LEAST_GYRATION_M2, most or math.inf)
         element.remark(
-            f"no body has this inertia (its largest principal moment, {most:.3g} kg m², exceeds the"
-            f" sum of the others): MuJoCo gets {mean:.3g} kg m² about every axis",
+            f"the body is a {'rod' if most else 'point'} (it has a principal moment of 0): MuJoCo"
+            f" gets {thin:.3g} kg m² there"
         )
-        return np.eye(3) * mean
-    return matrix
+        thicker: Vector = axes @ np.diag(np.maximum(moments, thin)) @ axes.T
+        return thicker
+    mean = float(np.trace(matrix)) / 3
+    why = f"its largest principal moment, {most:.3g} kg m², exceeds the sum of the others"
+    if least < 0:
+        why = f"its smallest principal moment is {least:.3g} kg m²"
+    element.remark(
+        f"no body has this inertia ({why}): MuJoCo gets {mean:.3g} kg m² about every axis"
+    )
+    return np.eye(3) * mean
+
+
+def _give_least_masses(building: Building, branches: Sequence[Branch]) -> None:
+    """Give moving bodies without mass what MuJoCo requires, and name their links.
+
+    A body counts with those that are fixed to it.
+    """
+    tops: dict[int, Branch] = {}  # by link: the body that it is rigidly joined to, nearest the root
+    heavy = set[int]()
+    for branch in branches:
+        top = branch
+        if branch.joint is not None and not _PARTS[branch.joint.type] and branch.parent is not None:
+            top = tops.get(id(branch.parent), branch)  # the link may be the world
+        tops[id(branch.link)] = top
+        if _is_heavy(building.body(branch.link)):
+            heavy.add(id(top.link))
+    for branch in branches:
+        is_moving = branch.joint is None or bool(_PARTS[branch.joint.type])
+        if not is_moving or branch.link.is_static or id(branch.link) in heavy:
+            continue
+        body = building.body(branch.link)
+        body.mass = max(body.mass, _LEAST_KG)
+        body.inertia = body.inertia + _LEAST_KG_M2
+        branch.link.element.remark(
+            f"'{branch.link.name}' moves, and has no mass or no inertia: MuJoCo gets {_LEAST_KG:g}"
+            f" kg and {_LEAST_KG_M2:g} kg m²; give it an <inertial>"
+        )
+
+
+def _is_heavy(body: Any) -> bool:
+    """Whether mass and inertia of a body suffice for MuJoCo, if it moves alone."""
+    if not body.explicitinertial:
+        return True  # computed from its shapes
+    return bool(min(body.mass, *body.inertia) >= mujoco.mjMINVAL)
 
 
 def _direction(joint: Joint, tag: str) -> Vector:
@@ -135,12 +221,11 @@ def _is_old(scope: Scope) -> bool:
     return False
 
 
-def is_known(joint: Joint) -> bool:
-    """Whether the type of a joint is known; a problem is reported."""
-    if joint.type in _PARTS:
+def is_known(joint: Element, types: Sequence[str]) -> bool:
+    """Whether the type of a joint is among ``types``; a problem is reported."""
+    if joint.type in types:
         return True
-    known = ", ".join(sorted(_PARTS))
-    joint.element.problem(f"'{joint.type}' is not a type of joint", f"there are: {known}")
+    joint.problem(f"'{joint.type}' is not a type of joint", f"there are: {', '.join(types)}")
     return False
 
 
@@ -153,7 +238,9 @@ def _add_joints(building: Building, branch: Branch, joint: Joint) -> None:
     # MuJoCo applies the joints of a body in their order, the first next to the parent.
     for kind, tag in reversed(parts) if branch.is_turned else parts:
         direction = _direction(joint, tag) if tag else None
-        made = body.add_joint(type=kind, pos=place.position)
+        made = body.add_joint(type=kind)
+        if kind != _FREE:
+            made.pos = place.position
         suffix = f"/{tag}" if len(parts) > 1 else ""
         if is_screw:
             suffix = "/turn" if kind == _HINGE else "/slide"
@@ -193,9 +280,13 @@ def _read_dynamics(axis: Element, joint: Any, joint_type: str) -> None:
         elif joint_type != "continuous" and (lower > -_NO_LIMIT or upper < _NO_LIMIT):
             lower, upper = max(lower, -_NO_LIMIT), min(upper, _NO_LIMIT)
             if lower == upper:
-                upper = math.nextafter(lower, math.inf)  # MuJoCo refuses an empty range
+                default = f" ({limit.text})" if limit.text else ""
+                limit.remark(f"'{joint.name}' is locked: both its limits are {lower:g}{default}")
+                upper = lower + max(_LOCKED[0], _LOCKED[1] * abs(lower))  # MuJoCo's is not empty
             joint.range, joint.limited = [lower, upper], True
         effort = limit.number("effort", math.inf)
+        if effort == 0:
+            limit.remark("an effort of 0 would let nothing drive the joint: there is no such limit")
         if 0 < effort < _NO_LIMIT:
             joint.actfrcrange, joint.actfrclimited = [-effort, effort], True
         velocity = limit.child("velocity")
@@ -211,15 +302,11 @@ def _read_dynamics(axis: Element, joint: Any, joint_type: str) -> None:
 
 def _follow(building: Building, joint: str, leader: str, offset: float, ratio: float) -> None:
     """Constrain the position of a joint to ``offset`` + ``ratio`` times that of another."""
-    equality = follow_joint(building.spec, joint, leader, offset, ratio)
-    equality.name = building.name("equality", f"{joint} follows {leader}", None)
-
-
-def follow_joint(spec: Any, joint: str, leader: str, offset: float, ratio: float) -> Any:
-    """Add the constraint to a spec, without a name; returns it."""
-    return _add_equality(
-        spec, mujoco.mjtEq.mjEQ_JOINT, mujoco.mjtObj.mjOBJ_JOINT, (joint, leader), [offset, ratio]
+    kind, names = mujoco.mjtEq.mjEQ_JOINT, (joint, leader)
+    equality = _add_equality(
+        building.spec, kind, mujoco.mjtObj.mjOBJ_JOINT, names, [offset, ratio if leader else 0.0]
     )
+    equality.name = building.name("equality", f"{joint} follows {leader}", None)
 
 
 def _add_equality(
@@ -231,7 +318,7 @@ def _add_equality(
     return equality
 
 
-def add_mimics(building: Building, scope: Scope) -> None:
+def _add_mimics(building: Building, scope: Scope) -> None:
     """``<mimic>`` of an axis: the joint follows another one (SDF 1.11)."""
     for inner, element in scope.each("joint"):
         for tag in ("axis", "axis2"):
@@ -240,14 +327,44 @@ def add_mimics(building: Building, scope: Scope) -> None:
                 continue
             leader = mimic.attributes.get("joint") or mimic.text_of("joint")
             mine = building.joints.get(inner.prefix + element.name, [])
-            theirs = building.joints.get(inner.prefix + leader.replace("::", "/"), [])
-            if len(mine) != 1 or len(theirs) != 1:
-                mimic.omit(f"'{leader}' and this joint must have one axis each for MuJoCo")
+            theirs = building.joints.get(inner.prefix + leader.replace("::", "/"))
+            if theirs is None:
+                mimic.omit(f"'{element.name}' follows '{leader}', and there is no such joint")
+                continue
+            if mine == theirs or len(mine) != 1 or len(theirs) > 1:
+                mimic.omit(f"'{element.name}' and '{leader}' must be two joints with one axis each")
                 continue
             ratio = mimic.number("multiplier", 1.0)
             offset = mimic.number("offset", 0.0)
             reference = mimic.number("reference", 0.0)
-            _follow(building, mine[0], theirs[0], offset - ratio * reference, ratio)
+            # A leader that does not move, a fixed joint, is at 0.
+            _follow(building, mine[0], "".join(theirs), offset - ratio * reference, ratio)
+
+
+def _exclude_contacts(building: Building, scope: Scope) -> None:
+    """Exclude contacts between links of one model, unless the model wants them."""
+    groups: dict[int, list[str]] = {}
+    for inner in scope.and_models():
+        outer = inner.outermost
+        if outer.self_collides or outer.is_static:
+            continue
+        names = groups.setdefault(id(outer), [])
+        names += [
+            building.body(link).name
+            for link in inner.links.values()
+            if any(id(child) in building.geoms for child in link.element.children)
+            and building.body(link).name != "world"
+        ]
+        if len(names) > _MOST_LINKS:
+            outer.element.problem(
+                f"more than {_MOST_LINKS} links of one model collide with other things",
+                "set <self_collide>: then no list of pairs is needed",
+            )
+            return
+    for names in groups.values():
+        for index, first in enumerate(names):
+            for second in names[index + 1 :]:
+                building.spec.add_exclude(bodyname1=first, bodyname2=second)
 
 
 def close_loop(building: Building, joint: Joint) -> None:

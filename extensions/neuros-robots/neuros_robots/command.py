@@ -113,5 +113,5 @@ def _converted(options: argparse.Namespace) -> tuple[Converted, Path, Path]:
     for folder in folders:
         if not folder.is_dir():
             raise UsageError(f"-I {folder}: there is no such folder")
-    convert = read_urdf if source.suffix.lower() == ".urdf" else convert_sdf
+    convert = read_urdf if source.suffix.lower() in (".urdf", ".xacro") else convert_sdf
     return convert(source, finder(folders, os.environ)), source, output

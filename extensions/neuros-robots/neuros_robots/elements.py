@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from urllib.parse import unquote
 from xml.parsers import expat
@@ -24,6 +26,18 @@ PATH_VARIABLES = (
     "ROS_PACKAGE_PATH",
 )
 _REMOTE = ("http://", "https://", "fuel://")
+_SERVERS = ("fuel.gazebosim.org", "fuel.ignitionrobotics.org", "api.ignitionfuel.org")
+_FUEL_CACHES = ("GZ_FUEL_CACHE_PATH", "IGN_FUEL_CACHE_PATH")
+_OWN_MODELS = Path(__file__).parent / "models"
+"""Models that Gazebo ships, and nearly every world of Gazebo Classic includes: the last resort."""
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/"
+# Comments, and what may hold the characters of a comment without being one.
+_COMMENT = re.compile(rb"<!--(?P<comment>.*?)-->|<!\[CDATA\[.*?\]\]>", re.DOTALL)
+_BEFORE_DECLARATION = re.compile(
+    rb"(?:\xef\xbb\xbf)?(?:\s|<!--.*?-->)*(?=<\?xml\s)|(?:\xef\xbb\xbf)?\s*", re.DOTALL
+)
+_VISIBLE = re.compile(rb"[^\r\n]")
+_DECLARED = re.compile(rb"<\?xml[^>]*\bencoding\s*=", re.DOTALL)
 _MOST_BYTES = 64 << 20
 _MOST_ELEMENTS = 200_000
 _FILE_ELEMENTS = 20  # the cost of opening a file, in elements
@@ -113,6 +127,7 @@ class Report:
 
     def __init__(self) -> None:
         self.problems: list[Problem] = []
+        self.places: dict[int, Element] = {}  # by the id of the problem
         self.notes: list[tuple[Element, str]] = []
         self._elements = 0
 
@@ -136,6 +151,18 @@ class Report:
                     is_extension = ":" in child.tag
                     child.omit(_EXTENSION if is_extension else _REASONS.get(child.tag, _UNKNOWN))
             self.omit_unread(root.children)
+
+    def listed(self, before: int) -> bool:
+        """Turn all problems after the first ``before`` ones into notes; whether there are any.
+
+        What is only seen changes no physics, so it need not be right.
+        """
+        found = self.problems[before:]
+        del self.problems[before:]
+        for problem in found:
+            hint = f" ({problem.hint})" if problem.hint else ""
+            self.places[id(problem)].omit(f"{problem.text}{hint}")
+        return bool(found)
 
     def raise_any(self) -> None:
         """Raise ``DescriptionError`` with all problems, if there are any."""
@@ -161,6 +188,7 @@ class Element:
     Attributes:
         text: its text, without the white space around.
         is_read: whether code has asked for it; unread elements are listed as unsupported.
+        source: the element of the file that this one is made from, whose place and path it has.
     """
 
     tag: str
@@ -173,6 +201,7 @@ class Element:
     text: str = ""
     children: list[Element] = field(default_factory=list)
     is_read: bool = False
+    source: Element | None = None
 
     @property
     def name(self) -> str:
@@ -185,12 +214,16 @@ class Element:
     @property
     def path(self) -> str:
         """Its path in the document, as ``model[arm]/link[base]/inertial``."""
+        if self.source is not None:
+            return self.source.path
         steps = [e.tag + (f"[{e.name}]" if e.name else "") for e in self.and_ancestors()][::-1]
         return "/".join(steps[1:] or steps)
 
     @property
     def kind(self) -> str:
         """The path without names."""
+        if self.source is not None:
+            return self.source.kind
         tags = [element.tag for element in self.and_ancestors()][::-1]
         return "/".join(tags[1:] or tags)
 
@@ -211,9 +244,17 @@ class Element:
             yield element
             element = element.parent
 
-    def made(self, tag: str, **attributes: str) -> Element:
-        """A new element at the place of this one, without a parent."""
-        return Element(tag, attributes, self.file, self.line, self.column, self.report)
+    def made(self, tag: str, *content: Element | str, **attributes: str) -> Element:
+        """A new element at the place of this one, without a parent; ``content``: text, children."""
+        place = self.file, self.line, self.column, self.report
+        element = Element(tag, attributes, *place, source=self.source or self)
+        for part in content:
+            if isinstance(part, str):
+                element.text = part
+            else:
+                part.parent = element
+                element.children.append(part)
+        return element
 
     # ---- children: asking for them marks them as read
 
@@ -305,7 +346,9 @@ class Element:
     def problem(self, text: str, hint: str = "") -> None:
         """Report a problem that makes the conversion impossible."""
         name = display_name(self.file)
-        self.report.problems.append(Problem(name, self.line, self.column, self.path, text, hint))
+        problem = Problem(name, self.line, self.column, self.path, text, hint)
+        self.report.problems.append(problem)
+        self.report.places[id(problem)] = self
 
     def omit(self, why: str) -> None:
         """Report that the element is left out; everything within counts as read."""
@@ -325,23 +368,29 @@ class _Unwanted(Exception):
 class _Builder:
     """Makes elements from the events of expat."""
 
-    def __init__(self, file: Path, report: Report) -> None:
+    def __init__(self, file: Path, report: Report, skipped_lines: int, encoding: str | None):
         self.root: Element | None = None
         self._file, self._report, self._open = file, report, list[Element]()
         self._texts: list[list[str]] = []
-        self.parser = expat.ParserCreate()
+        self.skipped_lines = skipped_lines
+        self.parser = expat.ParserCreate(encoding)
         self.parser.buffer_text = True
         self.parser.EntityDeclHandler = self._refuse_entity
         self.parser.StartElementHandler = self._start
         self.parser.EndElementHandler = self._end
         self.parser.CharacterDataHandler = self._characters
 
+    @property
+    def line(self) -> int:
+        """The present line of the file."""
+        return self.parser.CurrentLineNumber + self.skipped_lines
+
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         self._report.count(self._file, 1)
         if len(self._open) >= 2 * DEEPEST:
             raise _Unwanted(f"elements are nested more than {2 * DEEPEST} deep")
         parent = self._open[-1] if self._open else None
-        line, column = self.parser.CurrentLineNumber, self.parser.CurrentColumnNumber + 1
+        line, column = self.line, self.parser.CurrentColumnNumber + 1
         element = Element(tag, attributes, self._file, line, column, self._report, parent)
         if parent is None:
             self.root = element
@@ -365,20 +414,32 @@ class _Builder:
 def parse(file: Path, report: Report) -> Element | Problem:
     """The root of an XML file, or the problem with it.
 
+    What the readers of Gazebo and ROS accept, and XML forbids, is read, too: ``--`` in a comment,
+    space or a comment before the declaration, zero bytes at the end, and bytes that are not UTF-8
+    in a file without a declared encoding, which are read as Latin-1.
+
     Raises:
         DescriptionError: ``report`` has counted too many elements.
     """
     line, column = 1, 1
     report.count(file, _FILE_ELEMENTS)
-    builder = _Builder(file, report)
     try:
-        builder.parser.Parse(read_bytes(file, _MOST_BYTES), True)
+        data = read_bytes(file, _MOST_BYTES)
     except OSError as error:
         text = f"cannot be read: {error.strerror or error}"
+        return Problem(display_name(file), line, column, "/", text)
+    if data.startswith(_LFS_POINTER):
+        return Problem(display_name(file), line, column, "/", *_lfs_pointer("it"))
+    document = _COMMENT.sub(_blanked, _BEFORE_DECLARATION.sub(b"", data, count=1))
+    if document[1:2] != b"\0":  # not UTF-16
+        document = document.rstrip(b"\0")
+    builder = _Builder(file, report, data.count(b"\n") - document.count(b"\n"), _encoding(document))
+    try:
+        builder.parser.Parse(document, True)
     except _Unwanted as error:
-        line, column, text = builder.parser.CurrentLineNumber, 1, str(error)
+        line, text = builder.line, str(error)
     except expat.ExpatError as error:
-        line, column = error.lineno, error.offset + 1
+        line, column = error.lineno + builder.skipped_lines, error.offset + 1
         text = f"this is not XML: {expat.ErrorString(error.code)}"
     except (ValueError, LookupError) as error:  # LookupError: unknown encoding
         text = f"this is not XML: {error}"
@@ -386,6 +447,32 @@ def parse(file: Path, report: Report) -> Element | Problem:
         assert builder.root is not None, "expat reports an empty document itself"
         return builder.root
     return Problem(display_name(file), line, column, "/", text)
+
+
+def _blanked(match: re.Match[bytes]) -> bytes:
+    """A comment without its text; lines stay where they are."""
+    if match["comment"] is None:
+        return match[0]
+    return b"<!--" + _VISIBLE.sub(b" ", match["comment"]) + b"-->"
+
+
+def _encoding(document: bytes) -> str | None:
+    """The encoding that the parser is told; ``None``: the declared one, or UTF-8."""
+    if document[:2] in (b"\xff\xfe", b"\xfe\xff") or _DECLARED.match(document):
+        return None
+    try:
+        document.decode()
+    except UnicodeDecodeError:
+        return "iso-8859-1"
+    return None
+
+
+def _lfs_pointer(what: str) -> tuple[str, str]:
+    """What is wrong with a file of which Git LFS has left a pointer only, and what to do."""
+    return (
+        f"{what} is a Git LFS pointer, not the file itself",
+        "run `git lfs pull` in its repository",
+    )
 
 
 class NotFound(Exception):
@@ -402,41 +489,52 @@ class Finder:
 
     ``model://name/...`` and ``package://name/...`` are searched in ``folders``, then in the folders
     above the file that names them, where neighbouring models lie. A package may also lie in
-    ``share`` of a ROS installation.
+    ``share`` of a ROS installation. Addresses of Gazebo Fuel are searched in ``caches``, where
+    Gazebo keeps what it has downloaded.
     """
 
     folders: Sequence[Path] = ()
     packages: Sequence[Path] = field(default=())
+    caches: Sequence[Path] = ()
 
     def find(self, uri: str, here: Path) -> Path:
         """The file or folder behind ``uri``, which a file in the folder ``here`` names.
 
         Raises :class:`NotFound`.
         """
-        if uri.startswith(_REMOTE):
-            raise NotFound(
-                f"'{uri}' is on the network", "download it, for instance with `gz fuel download`"
-            )
         scheme, colon, rest = uri.partition("://")
+        hint = f"name its folder with -I, or in {' or '.join(PATH_VARIABLES[:2])}"
         if not colon:
             candidates = iter([here / uri, *(folder / uri for folder in self.folders)])
+        elif uri.startswith(_REMOTE):
+            candidates = self._downloaded(unquote(rest))
         elif scheme == "file":
-            candidates = iter([Path(unquote(rest)), here / unquote(rest)])
+            candidates, hint = iter([Path(unquote(rest)), here / unquote(rest)]), ""
         elif scheme in ("model", "package"):
             candidates = self._by_name(unquote(rest), here, scheme)
+            if scheme == "package":
+                hint = f"name the folder of the package with -I, or in {PATH_VARIABLES[-1]}"
         else:
             raise NotFound(f"'{uri}': there is no way to look up '{scheme}://'")
         for candidate in candidates:
             if os.path.exists(candidate):  # unlike Path.exists, accepts names of any length
                 return candidate.resolve()
-        hint = f"name its folder with -I, or in {' or '.join(PATH_VARIABLES[:2])}"
-        raise NotFound(f"'{uri}' cannot be found", "" if scheme == "file" else hint)
+        if uri.startswith(_REMOTE):
+            raise NotFound(
+                f"'{uri}' is on the network, and not among the models that Gazebo has downloaded",
+                f"`gz fuel download -u '{uri}'` puts a model of Gazebo Fuel into ~/.gz/fuel, where"
+                " it is found; anything else can be downloaded and named by its path",
+            )
+        raise NotFound(f"'{uri}' cannot be found", hint)
 
     def find_file(self, uri: str, here: Path) -> Path:
-        """The file behind ``uri``; a folder is not found."""
+        """The file behind ``uri``; a folder is not found, nor what Git LFS has not fetched."""
         found = self.find(uri, here)
         if not found.is_file():
             raise NotFound(f"'{uri}' is not a file")
+        with found.open("rb") as opened:
+            if opened.read(len(_LFS_POINTER)) == _LFS_POINTER:
+                raise NotFound(*_lfs_pointer(f"'{uri}'"))
         return found
 
     def _by_name(self, rest: str, here: Path, scheme: str) -> Iterator[Path]:
@@ -447,6 +545,25 @@ class Finder:
                 yield folder / inside
         for folder in (here, *here.parents):
             yield folder / name / inside
+            if folder.name.isdecimal() and folder.parent.name == name.lower():
+                yield folder / inside  # Gazebo keeps models of Fuel as name/version
+        yield _OWN_MODELS / name / inside
+
+    def _downloaded(self, address: str) -> Iterator[Path]:
+        """Where Gazebo keeps ``server/1.0/owner/models/name[/version[/files/...]]`` of Fuel."""
+        parts = [part for part in address.split("/") if part]
+        if len(parts) < 5 or parts[3] not in ("models", "worlds"):
+            return
+        server, _, owner, kind, name, *rest = parts
+        version, inside = (rest or [""])[0], "/".join(rest[2:])
+        # A server that has moved is in the cache under the name it had.
+        for cache, host in product(self.caches, (server, *_SERVERS)):
+            folder = cache / host / owner.lower() / kind / name.lower()
+            if version.isdecimal():
+                yield folder / version / inside
+            else:
+                kept = (child.name for child in folder.glob("[0-9]*") if child.name.isdecimal())
+                yield from (folder / each / inside for each in sorted(kept, key=int)[-1:])
 
 
 def finder(folders: Sequence[Path], environ: Mapping[str, str]) -> Finder:
@@ -455,4 +572,10 @@ def finder(folders: Sequence[Path], environ: Mapping[str, str]) -> Finder:
     for variable in PATH_VARIABLES:
         found += [Path(text) for text in environ.get(variable, "").split(os.pathsep) if text]
     prefixes = environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    return Finder(tuple(found), tuple(Path(text) / "share" for text in prefixes if text))
+    home = Path(environ.get("HOME", "~")).expanduser()
+    caches = [Path(environ[name]) for name in _FUEL_CACHES if environ.get(name)]
+    return Finder(
+        tuple(found),
+        tuple(Path(text) / "share" for text in prefixes if text),
+        (*caches, home / ".gz/fuel", home / ".ignition/fuel"),
+    )

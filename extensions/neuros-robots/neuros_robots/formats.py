@@ -32,5 +32,6 @@ class _Description(ModelFormat):
 
 
 URDF = _Description("urdf", read_urdf)
+XACRO = _Description("xacro", read_urdf)
 SDF = _Description("sdf", convert_sdf)
 WORLD = _Description("world", convert_sdf)

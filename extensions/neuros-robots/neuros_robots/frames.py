@@ -1,4 +1,4 @@
-"""Poses, named frames, and the tree of links in SDF; every model and world is a scope of names.
+"""Poses, named frames, and the tree of links; in SDF every model and world is a scope of names.
 
 A frame is a link, a joint, a nested model or a ``<frame>``; its pose is relative to another frame
 of its scope, or of a scope within (``arm::hand``). The own frame of a scope is called ``__model__``
@@ -312,12 +312,13 @@ def _add_frame(scope: Scope, element: Element) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A joint between two links, ``None`` being the world."""
+    """A joint between two links, ``None`` being the world; ``anchor`` is its pose in the world."""
 
     element: Element
     scope: Scope
     parent: Link | None
     child: Link | None
+    anchor: Pose
 
     @property
     def name(self) -> str:
@@ -326,11 +327,6 @@ class Joint:
     @property
     def type(self) -> str:
         return self.element.type
-
-    @property
-    def anchor(self) -> Pose:
-        """Its pose in the world."""
-        return self.scope.pose @ self.scope.place(self.element.name, self.element)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Parts of SDF links in MuJoCo: geoms of collisions and visuals, sensors, sites and lights.
+"""Parts of links in MuJoCo: geoms of collisions and visuals, sensors, sites and lights.
 
 A sensor becomes a site or camera called ``link/sensor``, which a node file names as the ``element``
 of a sensor. MuJoCo's cameras show colours only; a lidar is one rangefinder per ray.
@@ -7,7 +7,7 @@ of a sensor. MuJoCo's cameras show colours only; a lidar is one rangefinder per 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from neuros_robots.elements import Element
 from neuros_robots.frames import Joint, Link, Pose, Scope, from_quaternion, from_rpy
-from neuros_robots.mjcf import Building
+from neuros_robots.mjcf import Building, Triangles
 
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _GEOMS = mujoco.mjtGeom
@@ -63,6 +63,8 @@ _CAMERAS = {
 _TO_RAY = Pose(rotation=np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]))
 _MOST_RAYS = 1000
 _MOST_PIXELS = 1 << 16
+_CONE_SIDES = 64
+_WIDEST_RAD = math.radians(150)  # of a pinhole camera that still shows its middle
 _SAMPLES = {"horizontal": 640.0, "vertical": 1.0}  # default numbers of rays
 _SITE = mujoco.mjtObj.mjOBJ_SITE
 _LIGHTS = {
@@ -93,13 +95,17 @@ def add_shapes(building: Building, link: Link, *, is_solid: bool) -> None:
             if is_solid:
                 geom.density = element.number("density", 1000.0, positive=True)
     for element in link.element.each("visual"):
+        before = len(element.report.problems)
         geom = _add(building, link, element, is_solid=False)
+        opacity = 1.0 - element.number("transparency", 0.0)
+        material = element.child("material")
+        red, green, blue, alpha = _GREY if material is None else _diffuse(material)
+        is_wrong = element.report.listed(before)
         if geom is not None:
             geom.group, geom.contype, geom.conaffinity, geom.mass = _VISUAL_GROUP, 0, 0, 0
-            opacity = 1.0 - element.number("transparency", 0.0)
-            material = element.child("material")
-            red, green, blue, alpha = _GREY if material is None else _diffuse(material)
             geom.rgba = (red, green, blue, alpha * opacity)
+            if is_wrong:
+                building.spec.delete(geom)
 
 
 def share_masks(building: Building) -> None:
@@ -111,7 +117,8 @@ def share_masks(building: Building) -> None:
 
 def _add(building: Building, link: Link, element: Element, *, is_solid: bool) -> Any:
     shape = _read(building, element, is_solid=is_solid)
-    if shape is None:
+    geometry = next(iter((element.child("geometry") or element).children), element)
+    if shape is None or not _is_solid(geometry, shape.size):
         return None
     if shape.type == _GEOMS.mjGEOM_PLANE and not link.is_static:
         element.omit("MuJoCo has planes only where nothing moves")
@@ -138,23 +145,26 @@ def _read(building: Building, owner: Element, *, is_solid: bool) -> _Shape | Non
     if element is None:
         return None
     element.is_read = True
-
-    def positive(tag: str, default: float) -> float:
-        return element.number(tag, default, positive=True)
-
     match element.tag:
         case "empty":
             return None
         case "box":
             return _Shape(_GEOMS.mjGEOM_BOX, _halves(element, (1, 1, 1)))
         case "sphere":
-            return _Shape(_GEOMS.mjGEOM_SPHERE, [positive("radius", 1)])
+            return _Shape(_GEOMS.mjGEOM_SPHERE, [element.number("radius", 1)])
         case "cylinder" | "capsule" as kind:
-            size = [positive("radius", 0.5), positive("length", 1) / 2]
+            size = [element.number("radius", 0.5), element.number("length", 1) / 2]
             return _Shape(getattr(_GEOMS, f"mjGEOM_{kind.upper()}"), size)
+        case "cone":
+            size = [element.number("radius", 0.5), element.number("length", 1)]
+            if not _is_solid(element, size):
+                return None
+            triangles = _cone(*size)
+            name = building.meshes.add(element, "cone", triangles, is_solid=is_solid)
+            return _Shape(_GEOMS.mjGEOM_MESH, mesh=name)
         case "ellipsoid":
             radii = element.vector("radii", (1.0, 1.0, 1.0))
-            return _Shape(_GEOMS.mjGEOM_ELLIPSOID, _all_positive(element, radii))
+            return _Shape(_GEOMS.mjGEOM_ELLIPSOID, list(radii))
         case "plane":
             normal = np.array(element.vector("normal", (0.0, 0.0, 1.0)))
             if not normal.any():
@@ -170,22 +180,36 @@ def _read(building: Building, owner: Element, *, is_solid: bool) -> _Shape | Non
                 element.problem("<uri> is missing: which file is the mesh in?")
                 return None
             scale = element.vector("scale", (1.0, 1.0, 1.0))
-            is_needed = owner.tag == "collision"
-            name = building.meshes.add(uri, scale, is_solid=is_solid, is_needed=is_needed)
-            return None if name is None else _Shape(_GEOMS.mjGEOM_MESH, mesh=name)
+            found = building.meshes.add_file(uri, scale, is_solid=is_solid)
+            return None if found is None else _Shape(_GEOMS.mjGEOM_MESH, mesh=found)
     element.omit(f"MuJoCo has no geom for a <{element.tag}>")
     return None
 
 
+def _is_solid(element: Element, sizes: Sequence[float]) -> bool:
+    """Whether every size is positive. A shape of no size is left out: nothing can touch it."""
+    if not all(0 <= size < math.inf for size in sizes):
+        element.problem("every size must be positive")
+    elif not all(sizes):
+        element.omit("left out: it has no size")
+        return False
+    return True
+
+
+def _cone(radius: float, length: float) -> Triangles:
+    """A cone about z with its middle in the origin and its point upwards."""
+    angles = np.arange(_CONE_SIDES) * (2 * math.pi / _CONE_SIDES)
+    rim = [(radius * math.cos(a), radius * math.sin(a), -length / 2) for a in angles]
+    here, bottom, top = np.arange(_CONE_SIDES), _CONE_SIDES, _CONE_SIDES + 1
+    after = np.roll(here, -1)
+    sides = np.column_stack((here, after, np.full(_CONE_SIDES, top)))
+    base = np.column_stack((after, here, np.full(_CONE_SIDES, bottom)))
+    vertices = np.array([*rim, (0, 0, -length / 2), (0, 0, length / 2)])
+    return vertices, np.concatenate((sides, base)).astype(np.int32)
+
+
 def _halves(element: Element, default: tuple[float, ...]) -> list[float]:
-    return [length / 2 for length in _all_positive(element, element.vector("size", default))]
-
-
-def _all_positive(element: Element, sizes: tuple[float, ...]) -> list[float]:
-    if min(sizes) > 0:
-        return list(sizes)
-    element.problem("every size must be positive")
-    return [1.0] * len(sizes)
+    return [length / 2 for length in element.vector("size", default)]
 
 
 def _read_surface(building: Building, collision: Element, geom: Any) -> None:
@@ -197,6 +221,9 @@ def _read_surface(building: Building, collision: Element, geom: Any) -> None:
         along = friction.number("mu", 1.0)
         across = friction.number("mu2", along)
         geom.friction[0] = min(along, 1e6)
+        if along > 1:
+            # A pyramidal cone this wide is so soft along its axis that things fall through.
+            building.spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         if across != along:
             friction.remark(f"MuJoCo's friction is {along:g} in every direction")
     contact = surface.child("contact")
@@ -319,8 +346,10 @@ def _add_camera(building: Building, link: Link, element: Element, pose: Pose) ->
         settings.problem(f"an image has at most {_MOST_PIXELS} pixels a side")
         return
     if across >= math.pi:
-        settings.problem(f"the field of view must be below pi, not {across:g}")
-        return
+        settings.remark(
+            f"MuJoCo's pinhole camera cannot see {across:g} rad: it sees {_WIDEST_RAD:.3g} rad"
+        )
+        across = _WIDEST_RAD
     name, size = f"{link.name}/{element.name}", [int(width), int(height)]
     camera = building.add("camera", link, pose @ _TO_CAMERA, name, element, resolution=size)
     camera.fovy = math.degrees(2 * math.atan(math.tan(across / 2) * height / width))

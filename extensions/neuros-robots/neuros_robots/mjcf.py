@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -112,6 +113,37 @@ class Converted:
     joints: int
 
 
+def finished(building: Building, roots: Sequence[Element]) -> Converted:
+    """Compile the model that was made from documents, whose unread elements are listed.
+
+    Raises ``DescriptionError``.
+    """
+    report, spec = roots[0].report, building.spec
+    report.raise_any()
+    spec.compiler.degree = False
+    while True:
+        try:
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                model, boxed = _compile_boxed(spec, building.meshes.made, caught)
+            break
+        except (ValueError, mujoco.FatalError) as error:
+            if not building.meshes.drop_unusable():
+                if not report.problems:
+                    roots[0].problem(
+                        f"MuJoCo cannot compile the converted model: {message_of(error)}"
+                    )
+                report.raise_any()
+    why = {geom.name: str(slab) for geom, slab in boxed}
+    for name, mesh in building.colliding_meshes.items():
+        mesh.remark(why.get(name, "MuJoCo collides the convex hull of a mesh"))
+    for warning in caught:
+        roots[0].remark(f"MuJoCo: {' '.join(str(warning.message).split())}")
+    report.omit_unread(roots)
+    made = building.meshes.made
+    return Converted(spec, report.differences(), made, model.nbody - 1, model.njnt)
+
+
 def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
     """Write MJCF with the differences in a comment; returns all written files.
 
@@ -174,59 +206,72 @@ class Meshes:
     _names: dict[tuple[Path, tuple[float, ...], bool], str | None] = field(default_factory=dict)
     _places: dict[str, Element] = field(default_factory=dict)
 
-    def add(
-        self, uri: Element, scale: tuple[float, ...], *, is_solid: bool, is_needed: bool
-    ) -> str | None:
-        """The name of the asset for the file that ``uri`` names.
+    def add_file(self, uri: Element, scale: tuple[float, ...], *, is_solid: bool) -> str | None:
+        """The name of the asset for the file that ``uri`` names; ``None`` after a problem.
 
-        ``None`` if there is none: a missing file is a problem where it ``is_needed``, else a note.
         MuJoCo computes the mass of a solid mesh from its volume.
         """
         try:
             file = self.finder.find_file(uri.text, uri.file.parent)
         except NotFound as error:
-            if is_needed:
-                uri.problem(str(error), error.hint)
-            else:
-                uri.omit(f"{error} ({error.hint})" if error.hint else str(error))
+            uri.problem(str(error), error.hint)
             return None
         key = (file, scale, is_solid)
         if key not in self._names:
-            self._names[key] = self._new(uri, file, scale, is_solid)
-        elif self._names[key] is None:
-            uri.omit(why_unread(file))
+            source = _triangles_of(file) if _needs_conversion(file) else file
+            self._names[key] = (
+                None
+                if source is None
+                else self.add(uri, file.stem, source, scale, is_solid=is_solid)
+            )
+        if self._names[key] is None:
+            uri.problem(_why_unread(file))
         return self._names[key]
 
-    def report_unusable(self) -> None:
-        """Report the unusable meshes of a model that does not compile."""
-        for mesh in self.spec.meshes:
+    def drop_unusable(self) -> bool:
+        """Drop unusable meshes that are only seen; those that collide are problems.
+
+        Returns whether any was dropped.
+        """
+        dropped = False
+        for mesh in list(self.spec.meshes):
             try:
                 _compile_alone(mesh, self.made.get(mesh.name))
             except ValueError as error:
-                self._places[mesh.name].problem(f"MuJoCo cannot use the mesh: {message_of(error)}")
+                text = f"MuJoCo cannot use the mesh: {message_of(error)}"
+                geoms = [geom for geom in self.spec.geoms if geom.meshname == mesh.name]
+                if any(geom.contype or geom.conaffinity for geom in geoms):
+                    self._places[mesh.name].problem(text)
+                    continue
+                self._places[mesh.name].omit(f"left out: {text}")
+                for thing in (*geoms, mesh):
+                    self.spec.delete(thing)
+                dropped = True
+        return dropped
 
-    def _new(
-        self, uri: Element, file: Path, scale: tuple[float, ...], is_solid: bool
-    ) -> str | None:
-        triangles = None
-        if needs_conversion(file):
-            triangles = triangles_of(file)
-            if triangles is None:
-                uri.omit(why_unread(file))
-                return None
-        name, number = file.stem, 1
+    def add(
+        self,
+        place: Element,
+        wanted: str,
+        source: Path | Triangles,
+        scale: tuple[float, ...] = (1.0, 1.0, 1.0),
+        *,
+        is_solid: bool,
+    ) -> str:
+        """The name of a new asset, from a file that MuJoCo reads or from triangles."""
+        name, number = wanted, 1
         while name in self._places:
             number += 1
-            name = f"{file.stem}_{number}"
-        self._places[name] = uri
+            name = f"{wanted}_{number}"
+        self._places[name] = place
         mesh = self.spec.add_mesh(name=name, scale=scale)
         if not is_solid:  # a thin shell may be open, or flat
             mesh.inertia = _SHELL
-        if triangles is None:
-            mesh.file = str(file)
+        if isinstance(source, Path):
+            mesh.file = str(source)
         else:
-            fill(mesh, triangles)
-            self.made[name] = triangles
+            _fill(mesh, source)
+            self.made[name] = source
         return name
 
 
@@ -244,14 +289,14 @@ def _compile_alone(mesh: Any, triangles: Triangles | None, *, is_shown_only: boo
     alone = trial.add_mesh(name=mesh.name, file=mesh.file, scale=mesh.scale)
     alone.inertia = _SHELL if is_shown_only else mesh.inertia
     if triangles is not None:
-        fill(alone, triangles)
+        _fill(alone, triangles)
     geom = trial.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh.name)
     if is_shown_only:
         geom.contype = geom.conaffinity = 0
     return trial.compile()
 
 
-def why_unread(file: Path) -> str:
+def _why_unread(file: Path) -> str:
     """Why a file that needs conversion has no triangles, and what to do."""
     kind = "STL in text form" if _is_text_stl(file) else f"{file.suffix or 'such'} files"
     if file.suffix.lower() not in (*_CONVERTED, ".stl"):
@@ -261,12 +306,12 @@ def why_unread(file: Path) -> str:
     return "no triangles can be read from it (is it damaged?): convert it to OBJ"
 
 
-def needs_conversion(file: Path) -> bool:
+def _needs_conversion(file: Path) -> bool:
     """Whether MuJoCo does not read a file of this kind."""
     return file.suffix.lower() not in _READ_BY_MUJOCO or _is_text_stl(file)
 
 
-def fill(mesh: Any, triangles: Triangles) -> None:
+def _fill(mesh: Any, triangles: Triangles) -> None:
     """Give a mesh of a spec its triangles."""
     vertices, faces = triangles
     mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
@@ -282,7 +327,7 @@ def _is_text_stl(file: Path) -> bool:
     return head.startswith(b"solid") and file.stat().st_size != 84 + 50 * count
 
 
-def triangles_of(file: Path) -> Triangles | None:
+def _triangles_of(file: Path) -> Triangles | None:
     """The triangles of a file in metres, axes unchanged as in Gazebo; ``None`` if unreadable."""
     try:
         import trimesh
@@ -311,7 +356,7 @@ class Slab:
         return f"MuJoCo cannot collide a flat mesh: a box of {size} m stands in its place{outline}"
 
 
-def compile_boxed(
+def _compile_boxed(
     spec: Any, made: dict[str, Triangles], caught: list[Any]
 ) -> tuple[Any, list[tuple[Any, Slab]]]:
     """Compile a copy of an uncompiled spec, with boxes for flat meshes that collide.

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import mujoco
 
 from neuros.errors import Problem
+from neuros.project.scanner import display_name
 from neuros_robots import bodies, links
 from neuros_robots.elements import DEEPEST, Element, Finder, NotFound, Report, parse
 from neuros_robots.frames import Branch, Joint, Link, Scope, grow, place_all, read_scope
-from neuros_robots.mjcf import Building, Converted, Meshes, compile_boxed, message_of
+from neuros_robots.mjcf import Building, Converted, Meshes, finished
 
+_INCLUDED = ("model", "light", "actor")
 _OVERRIDDEN = ("pose", "static", "placement_frame")  # by the children of an <include>
-_MOST_LINKS = 1000
 _GRAVITY = (0.0, 0.0, -9.8)
 _MAGNETIC_FIELD_T = (5.5645e-6, 22.8758e-6, -42.3884e-6)
 
@@ -36,30 +35,18 @@ def convert_sdf(file: Path, finder: Finder) -> Converted:
     assert root is not None
     scope = _read(root)
     spec = mujoco.MjSpec()
-    spec.compiler.degree = False
     spec.modelname = (scope.element.name or next(iter(scope.models), "")) or "sdf"
     building = Building(spec, Meshes(spec, finder))
     branches, loops = _grow(scope)
     if scope.element.tag == "world":
         _read_world(building, scope)
-    for branch in branches:
-        bodies.add_body(building, branch)
-    links.share_masks(building)
-    for branch in branches:
-        if branch.joint is not None:
-            links.add_joint_sensors(building, branch.link, branch.joint, is_turned=branch.is_turned)
+    bodies.add_tree(building, scope, branches)
     for joint in loops:
         bodies.close_loop(building, joint)
-    bodies.add_mimics(building, scope)
     bodies.add_actuators(building, scope)
     links.add_frames(building, scope)
     links.add_lights(building, scope)
-    _exclude_contacts(building, scope)
-    report.raise_any()
-    model = _compiled(building, root)
-    report.omit_unread(includer.roots)
-    made = building.meshes.made
-    return Converted(spec, report.differences(), made, model.nbody - 1, model.njnt)
+    return finished(building, includer.roots)
 
 
 class Includer:
@@ -101,25 +88,26 @@ class Includer:
     def _included(
         self, include: Element, owner: Element, chain: Sequence[Path], depth: int
     ) -> list[Element]:
-        model = self._model(include, chain, depth)
+        model = self._content(include, chain, depth)
         if model is None:
             return []
         if named := include.text_of("name"):
             model.attributes["name"] = named
         for tag in _OVERRIDDEN:
             own = include.child(tag)
-            if own is not None:
+            if own is not None and (model.tag == "model" or tag == "pose"):
                 own.parent = model
                 model.children = [*(c for c in model.children if c.tag != tag), own]
         for child in include.children:
             if child.tag == "plugin" or ":" in child.tag:
                 child.omit("an addition to the included model for Gazebo")
-        if include.has("merge"):
+        if include.has("merge") and model.tag == "model":
             return _merged(model, owner)
         model.parent = owner
         return [model]
 
-    def _model(self, include: Element, chain: Sequence[Path], depth: int) -> Element | None:
+    def _content(self, include: Element, chain: Sequence[Path], depth: int) -> Element | None:
+        """The model, light or actor that a file holds."""
         uri = include.child("uri")
         if uri is None or not uri.text:
             include.problem("<uri> is missing: which model is to be included?")
@@ -136,12 +124,13 @@ class Includer:
         root = self.read(file, chain, depth)
         if root is None:
             return None
-        models = root.each("model")
-        if not models:
-            uri.problem(f"{file} holds no <model>")
+        found = next((e for tag in _INCLUDED for e in root.children if e.tag == tag), None)
+        if found is None:
+            uri.problem(f"{display_name(file)} holds no <{'>, <'.join(_INCLUDED)}>")
             return None
-        models[0].attributes.setdefault("_version", root.attributes.get("version", ""))
-        return models[0]
+        found.is_read = found.tag != "actor"  # which is listed
+        found.attributes.setdefault("_version", root.attributes.get("version", ""))
+        return found
 
 
 def model_file(path: Path) -> Path:
@@ -237,16 +226,16 @@ def _grow(scope: Scope) -> tuple[list[Branch], list[Joint]]:
     every_link = [link for inner in scope.and_models() for link in inner.links.values()]
     movable = []
     for inner, element in scope.each("joint"):
-        ends = [_end(inner, element, side) for side in ("parent", "child")]
-        joint = Joint(element, inner, *ends)
-        if not bodies.is_known(joint) or element.name not in inner.frames:
+        ends = parent, child = tuple(_end(inner, element, side) for side in ("parent", "child"))
+        if not bodies.is_known(element, bodies.SDF_TYPES) or element.name not in inner.frames:
             continue
         if all(end is None or end.is_static for end in ends):
             element.omit("left out: neither of its ends can move")
-        elif ends[0] is ends[1]:
+        elif parent is child:
             element.problem("joins a link to itself, or to a link that does not exist")
         else:
-            movable.append(joint)
+            anchor = inner.pose @ inner.place(element.name, element)
+            movable.append(Joint(element, inner, parent, child, anchor))
     return grow(every_link, movable)
 
 
@@ -256,50 +245,6 @@ def _end(scope: Scope, joint: Element, side: str) -> Link | None:
         joint.problem(f"<{side}> is missing: which link is the {side}?")
         return None
     return scope.body(name, joint.child(side) or joint)
-
-
-def _exclude_contacts(building: Building, scope: Scope) -> None:
-    """Exclude contacts between links of one model, unless the model wants them."""
-    groups: dict[int, list[str]] = {}
-    for inner in scope.and_models():
-        outer = inner.outermost
-        if outer.self_collides or outer.is_static:
-            continue
-        names = groups.setdefault(id(outer), [])
-        names += [
-            building.body(link).name
-            for link in inner.links.values()
-            if any(id(child) in building.geoms for child in link.element.children)
-        ]
-        if len(names) > _MOST_LINKS:
-            outer.element.problem(
-                f"more than {_MOST_LINKS} links of one model collide with other things",
-                "set <self_collide>: then no list of pairs is needed",
-            )
-            return
-    for names in groups.values():
-        for index, first in enumerate(names):
-            for second in names[index + 1 :]:
-                building.spec.add_exclude(bodyname1=first, bodyname2=second)
-
-
-def _compiled(building: Building, root: Element) -> Any:
-    try:
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            model, boxed = compile_boxed(building.spec, building.meshes.made, caught)
-    except (ValueError, mujoco.FatalError) as error:
-        building.meshes.report_unusable()
-        root.report.raise_any()
-        root.problem(f"MuJoCo cannot compile the converted model: {message_of(error)}")
-        root.report.raise_any()
-        raise
-    why = {geom.name: str(slab) for geom, slab in boxed}
-    for name, mesh in building.colliding_meshes.items():
-        mesh.remark(why.get(name, "MuJoCo collides the convex hull of a mesh"))
-    for warning in caught:
-        root.remark(f"MuJoCo: {' '.join(str(warning.message).split())}")
-    return model
 
 
 def _read_world(building: Building, scope: Scope) -> None:

@@ -124,7 +124,7 @@ def test_the_same_in_urdf(folder: Folder) -> None:
     converted = read_urdf(file, Finder(()))
     model = converted.spec.compile()
     (note,) = converted.differences
-    assert note.path == "link[floor]"
+    assert note.path == "link[floor]/collision/geometry/mesh"
     assert note.why == WHY
     assert sorted(model.geom_type) == [mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_MESH]
 

@@ -119,8 +119,8 @@ def test_a_name_of_a_mesh_may_be_longer_than_any_file_has(
     collision = f'<collision name="c"><geometry>{mesh}</geometry></collision>'
     error = said(capsys, tmp_path, SDF.format(f'<link name="l">{collision}</link>'))
     assert f"'{name}.stl' cannot be found" in error
-    visual = f'<visual><geometry><mesh filename="{name}.stl"/></geometry></visual>'
-    text = URDF.format("1", "1", visual + INERTIAL.format("1"), "")
+    shape = f'<collision><geometry><mesh filename="{name}.stl"/></geometry></collision>'
+    text = URDF.format("1", "1", shape + INERTIAL.format("1"), "")
     assert f"'{name}.stl' cannot be found" in said(capsys, tmp_path, text, "urdf")
     assert main(["convert", name]) == 2
 

@@ -46,7 +46,7 @@ class Docker(BackEnd):
         return " (and ".join([reason.removesuffix(_WITHOUT), *others])
 
     def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
-        return look_at_containers(STANDARD, environ)
+        return check_containers(STANDARD, environ)
 
     def on_this_machine(self, file: NodeFile, folders: Folders, messages: Path) -> NodeFile:
         return outside(file, folders, messages)
@@ -83,7 +83,7 @@ def check_modules(nodes: Sequence[Node], project: Path) -> None:
             )
 
 
-def look_at_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iterator[Finding]:
+def check_containers(names: Sequence[str], environ: Mapping[str, str]) -> Iterator[Finding]:
     """The engine and, if it answers, the images of NeuROS's own containers."""
     if find_spec("docker") is None:
         yield Finding.absent("Docker", "its Python package is not installed", install_command())

@@ -12,7 +12,6 @@ import json
 import os
 import re
 import secrets
-import subprocess
 import tarfile
 import tempfile
 import time
@@ -53,7 +52,7 @@ from neuros.backends.docker.images import (
 )
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.installation.progress import Progress
+from neuros.installation.progress import Progress, run_logged
 
 CERTIFICATES = "/tmp/neuros-ca-bundle.pem"
 """The user's certificates during a build; they are removed at the end."""
@@ -449,32 +448,18 @@ class _Builds:
         further: Mapping[str, bytes] = _NO_FILES,
     ) -> None:
         lines: list[str] = []
-        with (
-            context_of(folder, dockerfile, further) as context,
-            self._log.open("a", encoding="utf-8") as log,
-            subprocess.Popen(
-                ["docker", "build", "--force-rm", *options, "-"],
-                stdin=context,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                env=self._environ,
-                encoding="utf-8",
-                errors="replace",
-            ) as program,
-        ):
-            assert program.stdout is not None
-            try:
-                for line in program.stdout:
-                    log.write(line)
-                    plain = _COLOURS.sub("", line).rstrip()
-                    if plain.strip():
-                        lines.append(plain)
-                    if _SHOWN.match(plain):
-                        self._progress.detail(f"{self._name}: {plain.strip()}")
-            except BaseException:  # Ctrl+C, above all
-                program.terminate()
-                raise
-        if program.returncode:
+
+        def show(line: str) -> None:
+            plain = _COLOURS.sub("", line).rstrip()
+            if plain.strip():
+                lines.append(plain)
+            if _SHOWN.match(plain):
+                self._progress.detail(f"{self._name}: {plain.strip()}")
+
+        command = ["docker", "build", "--force-rm", *options, "-"]
+        with context_of(folder, dockerfile, further) as context:
+            code = run_logged(command, self._log, show, environ=self._environ, given=context)
+        if code:
             for line in lines[-_TAIL_LINES:]:
                 self._progress.step(f"  {line[:300]}")
             raise EnvironmentFault(

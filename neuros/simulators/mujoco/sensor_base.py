@@ -15,7 +15,7 @@ from neuros.ports import Packet
 from neuros.project.message_types import ArrayType, array_type
 from neuros.simulators.mujoco.cameras import Cameras
 from neuros.simulators.mujoco.lookup import Problems, find
-from neuros.time import to_stamp
+from neuros.time import set_stamp
 
 Vector: TypeAlias = "list[float]"
 """3 numbers, or 4 for a quaternion, w first, as plain floats."""
@@ -97,6 +97,7 @@ class Sensor:
         needs_forward: whether it measures what MuJoCo computes from the state of a step only in
             ``mj_forward``.
         declared: the declaration.
+        is_array: whether its packets are arrays.
         elements: sort and id of each element that it names.
     """
 
@@ -114,6 +115,7 @@ class Sensor:
         self, declared: SensorDeclaration, model: Any, cameras: Cameras, problems: Problems
     ) -> None:
         self.declared, self.model, self.cameras = declared, model, cameras
+        self.is_array = declared.array is not None
         found = [self.find(name, problems) for name in declared.elements]
         self.elements = [element for element in found if element]
         if len(self.elements) == len(found):
@@ -150,7 +152,7 @@ class Sensor:
 
 
 def set_header(header: Any, time_ns: int, frame: str) -> None:
-    header.stamp = to_stamp(nanoseconds=time_ns)
+    set_stamp(header.stamp, time_ns)
     header.frame_id = frame
 
 

@@ -50,7 +50,7 @@ from neuros.simulators.mujoco.sensor_base import (
     set_quaternion,
     set_vector,
 )
-from neuros.time import to_stamp
+from neuros.time import set_stamp
 
 _POINT_BYTES = 12
 
@@ -205,7 +205,7 @@ class JointStates(Sensor):
         self._speeds = self.model.jnt_dofadr[joints]
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
-        packet.header.stamp = to_stamp(nanoseconds=time_ns)
+        set_stamp(packet.header.stamp, time_ns)
         packet.name = list(self._names)
         packet.position = array("d", data.qpos[self._positions].tobytes())
         packet.velocity = array("d", data.qvel[self._speeds].tobytes())
@@ -450,7 +450,7 @@ class Clock(Sensor):
     needs_forward = False
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
-        packet.clock = to_stamp(nanoseconds=time_ns)
+        set_stamp(packet.clock, time_ns)
 
 
 SENSORS: Mapping[str, type[Sensor]] = {

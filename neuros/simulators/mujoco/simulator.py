@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, TimeoutError
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,7 @@ _BOUT_STEPS = 20
 _IDLE_S = 0.1
 _REFRESH_S = 1 / 60
 _SPACE = 32
+_ALONE = nullcontext()
 _CLOSE_S = 4.0  # shorter than a node's time to end; software OpenGL is slow to close
 
 
@@ -74,7 +76,8 @@ class MuJoCo:
                 closed=self.resume,
             )
         self._is_over = False
-        node.own_simulated_time(lambda: self.sim_time)
+        world = self._world
+        node.own_simulated_time(lambda: world.time.seconds(world.steps))
         node.show_world(self._view.observe)
         node.on_close(self.close)
         node.on_change(self._change_fields, self._world.check_fields)
@@ -117,16 +120,25 @@ class MuJoCo:
         """
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ModelError(f"step_synchronous: count is a whole number from 1, not {count!r}")
+        self._step_to(self._world.steps + count)
+
+    def step_to_next(self) -> None:
+        """Advance to the next firing of any sensor."""
+        target = self._world.schedule.next_firing(self._world.steps)
+        if target is None:
+            raise ModelError(f"{self._node.description.file}: no output has a sensor to step to")
+        self._step_to(target)
+
+    def _step_to(self, target: int) -> None:
+        world = self._world
         self._refuse_while_running("step_synchronous")
-        self._world.require_bound()
+        world.require_bound()
         # While the plugin waits here, only the user can resume, in the viewer.
         if self._lock.is_paused and (self._viewer is None or not self._viewer.is_open):
             raise ModelError("the simulation is paused: resume() it before it is stepped")
         while not self._is_over and self._lock.is_paused:
             self._sync_viewer()
             self._lock.wait_resumed(_IDLE_S)
-        world = self._world
-        target = world.steps + count
         if crossing := world.schedule.find_crossing(self._unread, world.steps, target):
             output, first, second = crossing
             when = world.time.seconds
@@ -136,13 +148,6 @@ class MuJoCo:
                 f"read('{output}') after each firing, every {second - first} steps"
             )
         self._advance_to(target)
-
-    def step_to_next(self) -> None:
-        """Advance to the next firing of any sensor."""
-        target = self._world.schedule.next_firing(self._world.steps)
-        if target is None:
-            raise ModelError(f"{self._node.description.file}: no output has a sensor to step to")
-        self.step_synchronous(target - self._world.steps)
 
     def read(self, output: str) -> Packet | None:
         """The packet of the sensor behind ``output`` that has come due since the last read."""
@@ -222,7 +227,7 @@ class MuJoCo:
             self._world.require_bound()
             hint = did_you_mean(input_name, self._world.commands)
             raise ModelError(f"no input '{input_name}' has an actuator{hint}")
-        self._set(lambda: command(packet))
+        self._set(partial(command, packet))
 
     def actuate(self, name: str, value: float) -> None:
         """Drive one actuator of the model, whether declared or not, from the next step on."""
@@ -276,8 +281,8 @@ class MuJoCo:
 
     def _set(self, controls: Callable[[], Controls]) -> None:
         # Where the plugin steps, no other thread uses the data.
-        with self.paused() if self.is_running else nullcontext():
-            ctrl = self.data.ctrl
+        with self.paused() if self.is_running else _ALONE:
+            ctrl = self._world.data.ctrl
             for actuator, value in controls():
                 ctrl[actuator] = value
 
@@ -319,7 +324,7 @@ class MuJoCo:
         return steps
 
     def _refuse_while_running(self, what: str) -> None:
-        if self.is_running:
+        if self._run is not None and self._run.is_running:
             raise ModelError(f"{what} is for a simulation that the plugin steps: stop() it first")
 
     def _sync_viewer(self) -> None:

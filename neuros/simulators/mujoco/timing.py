@@ -76,9 +76,12 @@ class FiringSchedule:
 
     def next_firing(self, step: int) -> int | None:
         """The first step after ``step`` at which any sensor fires; ``None`` without sensors."""
-        return min(
-            [step - step % period + period for period in self._periods.values()], default=None
-        )
+        found = None
+        for period in self._periods.values():  # a comprehension takes twice as long
+            firing = step - step % period + period
+            if found is None or firing < found:
+                found = firing
+        return found
 
     def due(self, step: int) -> tuple[str, ...]:
         """The sensors that fire at ``step``, in the order of their declaration."""
@@ -165,11 +168,7 @@ class StepLock:
         self._one_visitor = threading.RLock()
         self._visitors = 0
         self._is_stepping = False
-        self._is_paused = False
-
-    @property
-    def is_paused(self) -> bool:
-        return self._is_paused
+        self.is_paused = False
 
     @contextmanager
     def visit(self) -> Iterator[None]:
@@ -187,11 +186,11 @@ class StepLock:
 
     def pause(self) -> None:
         """Keep further steps from beginning until :meth:`resume`; returns at once."""
-        self._is_paused = True
+        self.is_paused = True
 
     def resume(self) -> None:
         with self._changed:
-            self._is_paused = False
+            self.is_paused = False
             self._changed.notify_all()
 
     def wake(self) -> None:
@@ -202,7 +201,7 @@ class StepLock:
     def wait_resumed(self, seconds: float) -> None:
         """Wait until stepping is resumed, at most ``seconds``, or until :meth:`wake`."""
         with self._changed:
-            if self._is_paused:
+            if self.is_paused:
                 self._changed.wait(seconds)
 
     def enter(self, cancelled: Callable[[], bool], seconds: float | None = None) -> bool:
@@ -212,7 +211,7 @@ class StepLock:
         """
         with self._changed:
             may_try = self._changed.wait_for(
-                lambda: cancelled() or not (self._is_paused or self._visitors), seconds
+                lambda: cancelled() or not (self.is_paused or self._visitors), seconds
             )
             if cancelled() or not may_try:
                 return False
@@ -232,7 +231,7 @@ class FreeRun:
     It begins at time 0 of the run, and ends when the simulated time of the run is over. Sending
     waits while a reliable connection is blocked; visitors of the lock may use model and data
     meanwhile. An error ends the node. In virtual time there is no thread: events of the node do
-    this, at the times of the virtual clock. In a replay, the node advances the world where it did.
+    this, at the times of the virtual clock. In a replay, the node advances the world.
 
     Args:
         advance: runs one bout and returns the packets that are due after it, by output.
@@ -259,8 +258,8 @@ class FreeRun:
         self._advance, self._sim_time, self._finish = advance, sim_time, finish
         self._idle = idle
         self._stopped = threading.Event()
-        self._is_driven = False  # by events of the node, so that there is no thread
         self._virtual = node.virtual_time
+        self._is_without_thread = False
         if self._virtual is not None:
             clock = self._virtual.clock_s
         self.pacer = Pacer(factor, clock, wait or self._stopped.wait)
@@ -270,21 +269,22 @@ class FreeRun:
 
     @property
     def is_running(self) -> bool:
-        is_alive = self._is_driven or self._thread.is_alive()
+        is_alive = self._is_without_thread or self._thread.is_alive()
         return is_alive and not self._stopped.is_set()
 
     def start(self) -> None:
-        self._is_driven = self._virtual is not None or self._node.drive(self._advance)
-        if self._virtual is not None:
-            self._virtual.when_active(self._start_in_virtual_time)
-        elif not self._is_driven:
+        self._is_without_thread = self._node.drive(self._advance) or self._virtual is not None
+        if not self._is_without_thread:
             self._thread.start()
+        elif self._virtual is not None:
+            self._virtual.when_active(self._start_in_virtual_time)
 
     def stop(self) -> None:
         """End the thread and wait for its end; callable again, and in the thread itself."""
         self._stopped.set()
         self._lock.wake()
-        if not self._is_driven and self._thread is not threading.current_thread():
+        is_own = self._thread is threading.current_thread()
+        if not self._is_without_thread and not is_own:
             self._thread.join(_JOIN_S)
 
     def _run(self) -> None:

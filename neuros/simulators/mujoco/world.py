@@ -6,6 +6,7 @@ import contextlib
 import copy
 import json
 import os
+import re
 from collections.abc import Callable, Iterable, Mapping, MutableSet, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from neuros.simulators.mujoco.sensor_base import Sensor
 from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
 from neuros.simulators.mujoco.timing import FiringSchedule, Timebase
 
+_PROLOGUE = re.compile(r"<!--.*?-->|<\?.*?\?>|<!DOCTYPE[^>]*>", re.DOTALL)
 _NUMBERS = (int, float, np.ndarray)  # types of fields of a model
 _WARNINGS = mujoco.mjtWarning
 _FATAL = (_WARNINGS.mjWARN_BADQPOS, _WARNINGS.mjWARN_BADQVEL, _WARNINGS.mjWARN_BADQACC)
@@ -125,6 +127,7 @@ class World(Declared):
         super().__init__(node.description, lambda: load_spec(node, model), problems, fine=fine)
         self.data = mujoco.MjData(self.model)
         self._warnings = self.data.warning.number
+        self._no_warnings = bytes(self._warnings.nbytes)
         if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
             import_opengl()  # raises now, not at the first image
         self.steps = 0
@@ -158,22 +161,25 @@ class World(Declared):
         """Advance the physics; raises ``ModelError`` if it has become unstable."""
         mujoco.mj_step(self.model, self.data, nstep=count)
         self.steps += count
-        if self._warnings.any():
+        if self._warnings.tobytes() != self._no_warnings:  # any() takes ten times as long
             self._report_warnings(count)
 
-    def sense(self, outputs: Iterable[str]) -> dict[str, Packet]:
+    def sense(self, outputs: Sequence[str]) -> dict[str, Packet]:
         """The packets of these sensors for the present state."""
-        sensors = {output: self._bound.sensors[output] for output in outputs}
-        if any(sensor.needs_forward for sensor in sensors.values()):
-            forward(self.model, self.data)
+        sensors = self._bound.sensors
+        for output in outputs:
+            if sensors[output].needs_forward:
+                forward(self.model, self.data)
+                break
         time_ns = self.time.nanoseconds(self.steps)
         packets = {}
-        for output, sensor in sensors.items():
-            packet = packets[output] = self._node.make_packet(output)
-            if sensor.declared.array is None:
-                sensor.fill(packet, self.data, time_ns)
-            else:
+        for output in outputs:
+            sensor, packet = sensors[output], self._node.make_packet(output)
+            packets[output] = packet
+            if sensor.is_array:
                 sensor.fill_array(packet, self.data)
+            else:
+                sensor.fill(packet, self.data, time_ns)
         return packets
 
     def reset(self) -> None:
@@ -459,11 +465,24 @@ def problems_of(description: Node, model: Path | str) -> list[tuple[str, str]]:
 
 def _from_text(description: Node, model: str) -> tuple[Any, str]:
     where = f"XML text in {description.plugin}"
+    if _is_urdf(model):
+        raise ModelError(f"{where}: this is URDF; write it to a file that ends in .urdf")
     return compiled(lambda: mujoco.MjSpec.from_string(model), where), where
+
+
+def _is_urdf(xml: str | Path) -> bool:
+    """Whether XML is URDF, which MuJoCo reads with defaults of its own in the place of URDF's."""
+    try:
+        text = xml if isinstance(xml, str) else xml.read_text("utf-8", "replace")
+    except OSError:
+        return False
+    return _PROLOGUE.sub("", text).lstrip("\ufeff \t\r\n").startswith("<robot")
 
 
 def _from_file(description: Node, path: Path, warn: Callable[[str], object]) -> Any:
     kind = path.suffix.lower()
+    if kind in (".xml", ".mjcf") and _is_urdf(path):
+        kind = ".urdf"
     if kind == ".xml":
         return compiled(lambda: mujoco.MjSpec.from_file(str(path)), str(path))
     if kind == ".mjcf":  # MuJoCo's from_file knows .xml only

@@ -7,7 +7,7 @@ import os
 import pytest
 
 from containers import require_containers
-from neuros.backends.docker.back_end import look_at_containers
+from neuros.backends.docker.back_end import check_containers
 from neuros.cli.main import main
 from neuros.doctor.checks import prove_delivery
 from neuros.ports import FindingState
@@ -19,7 +19,7 @@ def _with_containers() -> None:
 
 
 def test_engine_and_images_are_named_with_their_versions() -> None:
-    engine, image, missing = look_at_containers(["neuros_python", "no_such_image"], os.environ)
+    engine, image, missing = check_containers(["neuros_python", "no_such_image"], os.environ)
     assert engine.state is image.state is FindingState.GOOD
     assert engine.text.startswith("engine ")
     assert image.text.startswith("neuros_python:")

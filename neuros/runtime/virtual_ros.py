@@ -1,0 +1,421 @@
+"""A node in a process or container of its own, in virtual time, joined to the others by ROS.
+
+It is :mod:`neuros.runtime.virtual` with one node, whose events wait until its horizon lets them
+(:mod:`neuros.engine.horizon`). Packets and acknowledgements are those of real time. When they
+arrive in virtual time stands in the states of nodes, which travel on a topic per node,
+``/neuros/<node>/virtual_time``, as MessagePack in a latched ``std_msgs/msg/UInt8MultiArray``. Each
+message has all that the node knows, so that only the newest one counts.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import msgspec
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from std_msgs.msg import UInt8MultiArray
+
+from neuros.engine.horizon import NEVER_NS, Channel, Ending, Horizon, NodeState, Progress
+from neuros.ports import Inbox, Transport, TransportKind
+from neuros.project.model import Connection, NodeFile
+from neuros.project.names import INTERNAL
+from neuros.project.timing import LEAST_DELAY_NS
+from neuros.runtime.local import Event
+from neuros.runtime.virtual import DRAIN_S, Direction, NodeTime, VirtualLoop
+from neuros.transport.codecs import HEADER
+from neuros.transport.lean_node import LeanNode
+from neuros.transport.ros import (
+    ReceivingLink,
+    RosTransport,
+    SendingLink,
+    position_of,
+)
+from neuros.transport.ros_loop import RosLoop
+from neuros.transport.ros_process import RosProcess
+
+_TURN_NS = 1_000_000
+"""How long events of the node may keep those of ROS waiting, besides the hook that runs."""
+
+_ARRAY = struct.Struct("<4sIII")
+"""A ``std_msgs/msg/UInt8MultiArray`` in little-endian CDR, up to its bytes: no dimensions."""
+
+_ALL = QoSProfile(
+    history=QoSHistoryPolicy.KEEP_ALL,
+    reliability=QoSReliabilityPolicy.RELIABLE,
+    durability=QoSDurabilityPolicy.VOLATILE,
+)
+"""QoS of packets and acknowledgements: what is lost, the clock of the run decides."""
+
+# Only the newest state counts, but with a depth of 1 a state that takes the place of one that is
+# not acknowledged yet would wait for the next heartbeat of DDS, a second or more.
+_NEWEST = QoSProfile(
+    depth=256,
+    reliability=QoSReliabilityPolicy.RELIABLE,
+    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
+)
+
+
+class RosNodeTime(NodeTime):
+    """The clock and the events of the node of a process."""
+
+    _loop: RosVirtualLoop
+
+    def announce(self, duration_ns: int) -> None:
+        self._loop.tell(self.now_ns + duration_ns)
+
+    def hold(self, duration_ns: int) -> None:
+        super().hold(duration_ns)
+        self.post_loop_back(_end_of_hold)
+
+    def ready(self) -> None:
+        self._loop.is_ready = True
+
+    def at_zero(self, event: Event, first_pass: Event) -> None:
+        def begin() -> None:
+            event()
+            self.post(first_pass)
+
+        self._loop.at_zero(begin)
+
+    def drain(self, event: Event, stop: Event, *, is_asked: bool) -> None:
+        self._loop.drain_when_known(partial(super().drain, event, stop, is_asked=True), is_asked)
+
+
+class RosVirtualLoop(VirtualLoop):
+    """Runs the node of a process up to its horizon, in the loop that serves ROS.
+
+    Attributes:
+        horizon: of the node.
+        publish: publishes the states that it knows.
+        is_ready: whether the node has run its initialise hooks.
+    """
+
+    def __init__(self, seed: str, ros: RosLoop) -> None:
+        super().__init__(seed)
+        self._ros_loop = ros
+        self.horizon: Horizon
+        self.publish: Callable[[Sequence[NodeState]], None]
+        self.is_ready = False
+        self._has_posted = False
+        self._told = 0  # version of the newest state that the neighbours have
+        self._has_news = False
+        self._has_begun = False
+        # By connection and channel, what has come, and whose time of arrival is not known yet.
+        self._arrived: dict[tuple[Connection, str], deque[Event]] = {}
+        self._at_zero: Event | None = None
+        self._drain: Event | None = None  # what a node does when the end reaches it
+        self._is_draining = False
+
+    # ------------------------------------------------------------------ what the node asks for
+
+    def at_zero(self, event: Event) -> None:
+        """Handle an event at time 0 of the run, which is the same for all nodes."""
+        self._at_zero = event
+        self._wake()
+
+    def drain_when_known(self, drain: Event, is_asked: bool) -> None:
+        """Drain at the time of the end, which another node may have asked for."""
+        self._drain = drain
+        if not is_asked and self._end is None:
+            self.end("", DRAIN_S)
+        self._wake()
+
+    def drain(self, name: str, stop: Event) -> int:
+        assert self._end is not None
+        end_ns, asking, drain_ns = self._end
+        self.waits_for_rest = self._is_draining = True
+        self.limit_ns = end_ns + drain_ns
+        self._on_limit.append(stop)
+        return end_ns + (self.horizon.reach_ns()[asking] if asking else 0)
+
+    def plan(self, duration_s: float | None, on_end: Event, real_time_factor: float | None) -> None:
+        def end() -> None:
+            assert self.limit_ns is not None
+            self._end = self.limit_ns, "", round(DRAIN_S * 1e9)
+            on_end()
+
+        super().plan(duration_s, end, real_time_factor)
+
+    # ------------------------------------------------------------------ what arrives
+
+    def arrive(self, connection: Connection, channel: str, event: Event) -> None:
+        """A packet or an acknowledgement has come: handle it when its time has."""
+        self._arrived.setdefault((connection, channel), deque()).append(event)
+        self._wake()
+
+    def learn(self, states: Sequence[NodeState]) -> None:
+        """States of nodes have come."""
+        if not self.horizon.learn(states):
+            return
+        self._has_news = True
+        ending = self.horizon.ending()
+        if (
+            ending is not None
+            and not self._is_draining
+            and (self._end is None or ending < Ending(*self._end))
+        ):
+            self._end = ending.time_ns, ending.node, ending.drain_ns
+            reach_ns = self.horizon.reach_ns()[ending.node] if ending.node else 0
+            self.limit_ns, self._on_limit = ending.time_ns + reach_ns, []
+        self._wake()
+
+    # ------------------------------------------------------------------ running
+
+    def run(self) -> None:
+        self._wake()
+        self._ros_loop.run()
+
+    def stop(self) -> None:
+        super().stop()
+        self._ros_loop.stop()
+
+    def post_from_thread(self, event: Event) -> None:
+        super().post_from_thread(event)
+        self._ros_loop.post_from_thread(self._wake)
+
+    def step(self) -> bool:
+        for (connection, channel), events in self._arrived.items():
+            while events and (arrival_ns := self.horizon.arrival_ns(channel)) is not None:
+                self.horizon.receive(channel)
+                self._nodes[0].arrive(arrival_ns, connection.index, 0, events.popleft())
+        if self._at_zero is not None:
+            zero_ns = self.horizon.zero_ns(self._progress())
+            if zero_ns is not None:
+                event, self._at_zero = self._at_zero, None
+                self._nodes[0].wait_until(zero_ns)
+                self.now_ns, self._has_begun = zero_ns, True
+                event()
+                return True
+        if self._drain is not None and self._end is not None:
+            drain, self._drain = self._drain, None
+            drain()
+            return True
+        return super().step()
+
+    def tell(self, free_ns: int | None = None) -> None:
+        """Tell the neighbours the state of the node, if they have another; or others' news.
+
+        Args:
+            free_ns: when the hook that starts now ends; ``None``: none starts now.
+        """
+        state = self.horizon.state(self._progress(free_ns))
+        if state.version != self._told or self._has_news:
+            self._told, self._has_news = state.version, False
+            self.publish([state, *self.horizon.others])
+
+    def _make_node(self, name: str, place: int) -> NodeTime:
+        return RosNodeTime(self, name, place)
+
+    def _may_handle(self, time_ns: int) -> bool:
+        return not self.horizon.waits_for(time_ns)
+
+    def _progress(self, free_ns: int | None = None) -> Progress:
+        node = self._nodes[0]
+        if free_ns is None:
+            free_ns = node.now_ns if node.now_ns > node.instant_ns else -1
+        next_ns = node.next_ns
+        return Progress(
+            node.instant_ns,
+            NEVER_NS if next_ns is None else next_ns,
+            free_ns,
+            self.is_ready,
+            self.zero_ns if self._has_begun else -1,
+            None if self._end is None else Ending(*self._end),
+        )
+
+    def _wake(self) -> None:
+        if not self._has_posted:
+            self._has_posted = True
+            self._ros_loop.post_loop_back(self._advance)
+
+    def _advance(self) -> None:
+        self._has_posted = False
+        end_ns = time.monotonic_ns() + _TURN_NS
+        while self.step():
+            if time.monotonic_ns() > end_ns:
+                self._wake()
+                break
+        self.tell()
+
+
+class VirtualSendingLink(SendingLink):
+    """One connection at its sender, in virtual time."""
+
+    def open_in(self, loop: RosVirtualLoop, node_time: NodeTime) -> None:
+        """The receiver is there: from now on packets get their times of arrival."""
+        self._loop, self._time = loop, node_time
+        self._direction = Direction(loop.seed, "delay", self._connection)
+        self._publish, self.publish = self.publish, self._send
+
+    def receive_position(self, data: bytes) -> None:
+        if self.is_open:
+            event = partial(self._inbox.on_acknowledgement, self._connection, position_of(data))
+            self._loop.arrive(self._connection, _positions(self._connection), event)
+
+    def _send(self, data: bytes) -> None:
+        way = self._direction.send(self._time.now_ns)
+        if way is not None:
+            self._loop.horizon.send(_packets(self._connection), way[0])
+            self._publish(data)
+
+
+class VirtualReceivingLink(ReceivingLink):
+    """One connection at its receiver, in virtual time."""
+
+    def __init__(
+        self, loop: RosVirtualLoop, node_time: NodeTime, connection: Connection, *more: Any
+    ) -> None:
+        super().__init__(connection, *more)
+        self._connection = connection
+        self._loop, self._time = loop, node_time
+        self._direction = Direction(loop.seed, "acknowledgement", connection)
+
+    def receive(self, data: bytes) -> None:
+        packet = self._decode(data) if self.is_open else None
+        if packet is not None:
+            event = partial(self._arrive, packet, self._digest(data, packet))
+            self._loop.arrive(self._connection, _packets(self._connection), event)
+
+    def acknowledge(self, position: int) -> None:
+        if self.is_open and self._publish is not None:
+            way = self._direction.send(self._time.now_ns)
+            assert way is not None  # no acknowledgement is lost
+            self._loop.horizon.send(_positions(self._connection), way[0])
+        super().acknowledge(position)
+
+    def _arrive(self, packet: Any, digest: int) -> None:
+        if self.is_open:
+            self._digests.append(digest)
+            self._deliver(packet)
+
+
+class RosVirtualTransport(RosTransport):
+    """Carries the packets of one node over ROS topics, each with its time of arrival."""
+
+    _make_sending_link = VirtualSendingLink
+
+    def __init__(self, file: NodeFile, ros_node: LeanNode, ros: RosLoop, loop: RosVirtualLoop):
+        super().__init__(file, ros_node, ros)
+        self._virtual = loop
+        self._time = loop.of(file.node.name)
+        self.has_taken_in = self._time.has_taken_in  # type: ignore[method-assign]
+        self._make_receiving_link = partial(VirtualReceivingLink, loop, self._time)
+        name, inward, outward = file.node.name, {}, []
+        for c in file.connections:
+            delay_ns = max(LEAST_DELAY_NS, c.delay.least_ns)
+            if c.source_node == c.destination_node:
+                continue
+            if c.source_node == name:
+                outward.append(Channel(_packets(c), c.destination_node, delay_ns))
+                if c.is_reliable:
+                    inward[_positions(c)] = c.destination_node
+            else:
+                inward[_packets(c)] = c.source_node
+                if c.is_reliable:
+                    outward.append(Channel(_positions(c), c.source_node, delay_ns))
+        loop.horizon = Horizon(name, inward, outward)
+        namespace = file.names.namespace
+        publisher = ros_node.create_publisher(UInt8MultiArray, _topic(namespace, name), _NEWEST)
+        loop.publish = partial(_publish, publisher)
+        for neighbour in sorted(loop.horizon.neighbours):
+            ros_node.create_subscription(
+                UInt8MultiArray,
+                _topic(namespace, neighbour),
+                ros.guarded(lambda data: loop.learn(_states_in(data))),
+                _NEWEST,
+                raw=True,
+            )
+
+    def _data_qos(self, connection: Connection, *, is_reader: bool = False) -> QoSProfile:
+        return _ALL
+
+    def _position_qos(self, *, is_reader: bool) -> QoSProfile:
+        return _ALL
+
+    def _on_receiver_found(self, connection: Connection, note: str, inbox: Inbox) -> None:
+        self._prepare(connection, note)
+        link = self._sending[connection]
+        assert isinstance(link, VirtualSendingLink)
+        link.open_in(self._virtual, self._time)
+        self._time.post(partial(inbox.on_registered, connection))
+
+    def note_execution(self) -> None:
+        """Nothing: see :class:`NodeTime`."""
+
+
+class RosVirtualProcess(RosProcess):
+    """ROS in a process whose node is in virtual time (:class:`neuros.ports.Middleware`)."""
+
+    def __init__(
+        self, files: Sequence[NodeFile], on_failure: Callable[[BaseException], None], **more: Any
+    ) -> None:
+        super().__init__(files, on_failure, **more)
+        self.loop = self.virtual = RosVirtualLoop(files[0].seed, self.ros_loop)
+
+    def transport(self, file: NodeFile) -> Transport:
+        transport = RosVirtualTransport(file, self.ros_node(file), self.ros_loop, self.virtual)
+        self._transports.append(transport)
+        return transport
+
+    def take_in(self) -> None:
+        super().take_in()
+        self.virtual.take_in()
+
+    def loop_of(self, file: NodeFile) -> NodeTime:
+        return self.virtual.of(file.node.name)
+
+
+class _VirtualRos(TransportKind):
+    """``virtual-ros``: nodes in processes of their own, or in containers, in virtual time."""
+
+    name = "virtual-ros"
+
+    def middleware(
+        self,
+        files: Sequence[NodeFile],
+        on_failure: Callable[[BaseException], None],
+        *,
+        digests: bool,
+        record: bool,
+        debug: bool,
+    ) -> RosVirtualProcess:
+        return RosVirtualProcess(files, on_failure, debug=debug)
+
+
+VIRTUAL_ROS = _VirtualRos()
+
+_DECODER = msgspec.msgpack.Decoder(list[NodeState])
+
+
+def _end_of_hold() -> None:
+    """An event at the end of a hook: then the neighbours learn that the node is free."""
+
+
+def _publish(publisher: Publisher, states: Sequence[NodeState]) -> None:
+    data = msgspec.msgpack.encode(states)
+    publisher.handle.publish_raw(_ARRAY.pack(HEADER, 0, 0, len(data)) + data)
+
+
+def _states_in(data: bytes) -> list[NodeState]:
+    *_, size = _ARRAY.unpack_from(data)
+    return _DECODER.decode(data[_ARRAY.size : _ARRAY.size + size])
+
+
+def _topic(namespace: str, node: str) -> str:
+    return f"{namespace}{INTERNAL}{node}/virtual_time"
+
+
+def _packets(connection: Connection) -> str:
+    """The channel of the packets of a connection."""
+    return f"{connection.topic}/data"
+
+
+def _positions(connection: Connection) -> str:
+    """The channel of its acknowledgements."""
+    return f"{connection.topic}/ack"
