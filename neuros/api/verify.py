@@ -142,7 +142,8 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> RunComparison:
 
     Where nodes have kept no digests, those of the bags of the runs are compared. Which packets
     hooks consume of a connection that may lose packets depends on timing: such a difference is
-    only a remark.
+    only a remark. In virtual time it is none, and neither is one between the times at which packets
+    were sent and hooks started.
     """
     comparer = _Comparer((a, b), recorded)
     for name in dict.fromkeys([*a.connections, *b.connections]):
@@ -152,6 +153,7 @@ def compare(a: PastRun, b: PastRun, recorded: RecordedPackets) -> RunComparison:
             only = "A" if name in a.connections else "B"
             text = f"{name}: only run {only} has this connection"
             comparer.differences.append(_Difference(-1.0, text))
+    comparer.compare_hooks()
     comparer.compare_values()
     return comparer.result()
 
@@ -200,6 +202,7 @@ class _Comparer:
         self._consumed_differently: list[str] = []
         self._not_compared: list[str] = []
         self._compared = 0
+        self._is_virtual = all("virtual_s" in run.record for run in runs)
 
     def result(self) -> RunComparison:
         text, cause = None, ""
@@ -265,13 +268,32 @@ class _Comparer:
             consumed = _consumed(name, in_a, in_b)
         consumed = consumed or self._counted(name)
         sent = _sent(name, in_a, in_b)
+        is_lossless = self._runs[0].connections[name]["discard_limit"] == 0
+        timed = _timed(name, in_a, in_b) if self._is_virtual else None
         if sent is not None:
             self.differences.append(sent)
-        elif consumed is not None and self._runs[0].connections[name]["discard_limit"] == 0:
+        elif consumed is not None and (is_lossless or self._is_virtual):
             self.differences.append(consumed)
+        elif timed is not None:
+            self.differences.append(timed)
         elif consumed is not None:
             self._consumed_differently.append(name)
             self._remarks.append(f"{consumed.text}: this connection may lose packets")
+
+    def compare_hooks(self) -> None:
+        """Compare how often hooks started in virtual time, and how long they took."""
+        a, b = (run.nodes for run in self._runs)
+        for node in [name for name in a if name in b] if self._is_virtual else ():
+            hooks = [nodes[node].get("hooks", {}) for nodes in (a, b)]
+            for hook in dict.fromkeys([*hooks[0], *hooks[1]]):
+                figures = [
+                    (each.get(hook, {}).get("executions", 0), each.get(hook, {}).get("busy_s", 0.0))
+                    for each in hooks
+                ]
+                if figures[0] != figures[1]:
+                    a_text, b_text = (f"{n} times, for {s:.9g} s" for n, s in figures)
+                    text = f"hook '{hook}' of {node} ran {a_text} in run A, and {b_text} in run B"
+                    self.differences.append(_Difference(np.inf, text))
 
     def compare_values(self) -> None:
         """Compare the files of what plugins keep, and of what was restored to them."""
@@ -362,6 +384,20 @@ def _consumed(name: str, in_a: PacketLists, in_b: PacketLists) -> _Difference | 
     else:
         what = f"hooks took different packets as number {place + 1}"
     return _Difference(at_ns, f"{name}: {what}")
+
+
+def _timed(name: str, in_a: PacketLists, in_b: PacketLists) -> _Difference | None:
+    """The first packet that was sent, or that a hook started on, at another virtual time."""
+    for what, a, b in (
+        ("packet {} was sent", in_a.sent_ns, in_b.sent_ns),
+        ("the hook of start {} started", in_a.taken_ns, in_b.taken_ns),
+    ):
+        place = _first_difference(a, b)
+        if place < min(len(a), len(b)):
+            times = f"at {a[place] / 1e9:.9g} s in run A, and at {b[place] / 1e9:.9g} s in run B"
+            text = f"{name}: {what.format(place + 1)} {times}"
+            return _Difference(float(a[place]), text)
+    return None
 
 
 def _first_difference(a: Numbers, b: Numbers) -> int:

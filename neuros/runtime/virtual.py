@@ -98,8 +98,8 @@ class NodeTime:
 
     @property
     def zero_ns(self) -> int:
-        """Time 0 of the run, on the clock of the node."""
-        return self._loop.zero_ns
+        """Time 0 of the run, on the clock of the node; before it, now."""
+        return self._loop.zero_ns if self._loop.has_begun else self.now_ns
 
     @property
     def seed(self) -> str:
@@ -183,6 +183,7 @@ class VirtualLoop(LocalLoop):
     Attributes:
         now_ns: the latest instant of any node.
         zero_ns: time 0 of the run.
+        has_begun: whether that has come.
         waits_for_rest: whether what is asked for comes only when no event is left.
         limit_ns: nothing happens from this time on, until it is ``None``.
     """
@@ -197,6 +198,7 @@ class VirtualLoop(LocalLoop):
         self._by_name: dict[str, NodeTime] = {}
         self._next: list[tuple[int, int]] = []
         self.now_ns = self.zero_ns = 0
+        self.has_begun = False
         self.waits_for_rest = True
         self.limit_ns: int | None = None
         self._on_limit: list[Event] = []
@@ -227,8 +229,9 @@ class VirtualLoop(LocalLoop):
 
     def begin(self) -> None:
         """Time 0 of the run has come: for each node, in one event."""
-        if not self.waits_for_rest:
+        if self.has_begun:
             return
+        self.has_begun = True
         self.synchronise()
         self.zero_ns = self.now_ns
         self._began_s = time.monotonic()

@@ -176,6 +176,34 @@ def test_one_that_may_lose_packets_may_have_lost_others(folders: tuple[Path, Pat
     assert found.consumed_differently == (FIRST,)
 
 
+def virtual(run_: PastRun, **nodes: Any) -> PastRun:
+    return PastRun(run_.folder, {**run_.record, "virtual_s": 1.0, "nodes": nodes})
+
+
+def test_in_virtual_time_no_run_may_lose_others(folders: tuple[Path, Path]) -> None:
+    a = virtual(run(folders[0], {FIRST: [1, 2]}, discard_limit=None))
+    b = virtual(run(folders[1], {FIRST: [1, 2]}, taken={FIRST: [2]}, discard_limit=None))
+    assert "hooks took different packets as number 1" in (verdict(a, b).difference or "")
+
+
+def test_in_virtual_time_the_starts_of_hooks_are_compared(folders: tuple[Path, Path]) -> None:
+    a, b = (run(folder, {FIRST: [1, 2]}) for folder in folders)
+    late = np.array([5, 16], np.int64)
+    (b.folder / "b" / "packets" / "0.taken_ns").write_bytes(late.tobytes())
+    assert verdict(a, b).difference is None
+    found = verdict(virtual(a), virtual(b)).difference
+    start = "the hook of start 2 started at 1.5e-08 s in run A, and at 1.6e-08 s in run B"
+    assert found == f"{FIRST}: {start}"
+
+
+def test_in_virtual_time_executions_are_compared(folders: tuple[Path, Path]) -> None:
+    hooks = [{"hooks": {"tick": {"executions": n, "busy_s": 0.5}}} for n in (3, 4)]
+    a, b = (virtual(run(f, {FIRST: [1]}), a=h) for f, h in zip(folders, hooks, strict=True))
+    found = verdict(a, b).difference
+    counts = "3 times, for 0.5 s in run A, and 4 times, for 0.5 s in run B"
+    assert found == f"hook 'tick' of a ran {counts}"
+
+
 def test_counters_tell_what_lists_of_packets_do_not(folders: tuple[Path, Path]) -> None:
     a, b = (run(folder, {FIRST: [1, 2]}, discard_limit=None) for folder in folders)
     assert verdict(a, b).consumed_differently == ()

@@ -21,6 +21,8 @@ from neuros.hooks import (
 from neuros.project.model import Connection
 from neuros.project.timing import Distribution
 from neuros.runtime.virtual import reach_ns
+from neuros.simulators.mujoco import MuJoCo
+from neuros.time import to_nanoseconds
 
 FLOAT = "std_msgs/msg/Float64"
 MS = 1_000_000
@@ -245,6 +247,50 @@ def test_packets_of_a_node_to_itself_arrive_at_the_end_of_the_hook(tmp_path: Pat
     assert log.calls == [(14 * MS, 10.0), (24 * MS, 20.0)]
 
 
+WORLD = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody><body><joint name="turn" axis="0 0 1"/><geom size=".1"/></body></worldbody>
+</mujoco>
+"""
+
+
+def test_physics_that_runs_by_itself_follows_the_virtual_clock(tmp_path: Path) -> None:
+    log = Log()
+
+    @neuros_initialise()
+    def begin(node: Any) -> None:
+        MuJoCo(node, WORLD).run_asynchronous(0.5)
+
+    sensor = {"sensor": "clock", "rate": 50}
+    a = neuros.Node(
+        "a",
+        begin,
+        outputs={"clock": {"type": "rosgraph_msgs/msg/Clock", "mujoco": sensor}},
+    )
+
+    @neuros_function(inputs="clock")
+    def receive(node: Any, clock: Any) -> None:
+        log.note(node, to_nanoseconds(clock) / MS)
+
+    b = neuros.Node("b", receive, inputs={"clock": "rosgraph_msgs/msg/Clock"})
+    run(tmp_path, log, [a, b], [neuros.Connection(a["clock"], b["clock"], delay=0.001)], 0.2)
+    # 20 ms of simulated time take 40 ms. The first packet waits for the begin of the run, since a
+    # session holds what sends, not what computes.
+    assert [value for _, value in log.calls] == [20, 40, 60, 80, 100]
+
+
+def test_physics_as_fast_as_possible_takes_no_time(tmp_path: Path) -> None:
+    @neuros_initialise()
+    def begin(node: Any) -> None:
+        MuJoCo(node, WORLD).run_asynchronous(None)
+
+    sensor = {"sensor": "clock", "rate": 50}
+    clock = {"type": "rosgraph_msgs/msg/Clock", "mujoco": sensor}
+    found = fails(tmp_path, [neuros.Node("a", begin, outputs={"clock": clock})], [])
+    assert "run_asynchronous(None) takes no virtual time: give a real_time_factor" in found
+
+
 # ---------------------------------------------------------------------- draws
 
 
@@ -413,10 +459,10 @@ def ticking(folder: Path, **keys: Any) -> neuros.Project:
     return neuros.Project([neuros.Node("a", "p.py")], folder=folder, **keys)
 
 
-def test_a_back_end_of_several_processes_is_refused(tmp_path: Path) -> None:
+def test_nodes_elsewhere_are_refused(tmp_path: Path) -> None:
     described = ticking(tmp_path, time="virtual")
-    with pytest.raises(UsageError, match="use --backend in-process"):
-        described.run(backend="process", duration=1)
+    with pytest.raises(UsageError, match="--network: nodes elsewhere are in real time"):
+        described.run(backend="in-process", duration=1, network=True)
 
 
 def test_a_pace_of_real_time_is_refused(tmp_path: Path) -> None:

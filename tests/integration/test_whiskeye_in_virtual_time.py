@@ -1,0 +1,36 @@
+"""WhiskEye in virtual time: a run that may lose packets is the same in every repetition."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from launching import EXAMPLES, launch
+
+from neuros.api.run_record import PastRun, open_run
+from neuros.api.verify import RecordedPackets, compare
+
+WHISKEYE = EXAMPLES / "4_neurorobotics/whiskeye"
+DURATIONS = 'nodes.snn.durations.integrate={"normal":[0.045,0.005]}'
+
+
+def run(folder: Path, project: str) -> PastRun:
+    finished = launch(
+        WHISKEYE / f"{project}.json",
+        *("--backend", "in-process", "--time", "virtual", "-o", str(folder)),
+        *("--set", "nodes.robot.environment.DURATION=1", "--set", DURATIONS),
+        cwd=folder.parent,
+    )
+    assert finished.exit_code == 0, finished.output
+    return open_run(folder)
+
+
+@pytest.mark.parametrize("project", ["no_discard_limit", "asynchronous", "tick_60ms"])
+def test_a_lossy_run_can_be_repeated(project: str, tmp_path: Path) -> None:
+    a, b = (run(tmp_path / name, project) for name in "ab")
+    found = compare(a, b, RecordedPackets())
+    assert (found.difference, found.remarks, found.not_compared) == (None, (), ())
+    assert found.compared > 0
+    imu = a.connections["robot.imu -> snn.imu"]
+    if project != "tick_60ms":
+        assert 20 <= imu["consumed"] < imu["sent"]  # a packet each 20 ms, and a hook takes 45
