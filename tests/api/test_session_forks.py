@@ -196,6 +196,7 @@ def test_a_fork_begins_with_the_last_reset_and_its_settings(tmp_path: Path) -> N
 moves = st.lists(
     st.one_of(
         st.tuples(st.just("step"), st.integers(1, 4)),
+        st.tuples(st.just("until"), st.integers(1, 3)),
         st.tuples(st.just("send"), st.integers(-5, 5)),
         st.tuples(st.just("look"), st.just(0)),
     ),
@@ -208,6 +209,9 @@ def play(s: Session, done: list[tuple[str, int]]) -> list[float]:
     for what, number in done:
         if what == "step":
             found += sums(s, number)
+        elif what == "until":
+            count = s["grower.sum"].count + number
+            s.step(until=lambda s, count=count: s["grower.sum"].count >= count)
         elif what == "send":
             s.send("grower.more", Float64(data=float(number)))
         else:

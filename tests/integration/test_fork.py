@@ -79,7 +79,7 @@ def watch(node):
 """
 )
 RATE_HZ = 50
-VIRTUAL = ("--time", "virtual", "--backend", "in-process")
+VIRTUAL = ("--time", "virtual")
 
 
 def write_project(folder: Path, *, is_strict: bool = True) -> Path:
@@ -111,7 +111,7 @@ def write_project(folder: Path, *, is_strict: bool = True) -> Path:
 
 
 def recorded(folder: Path, *options: str) -> Finished:
-    project = write_project(folder / "project", is_strict=VIRTUAL[0] not in options)
+    project = write_project(folder / "project", is_strict=VIRTUAL[1] not in options)
     run = launch(project, *options, "-r", cwd=folder, timeout_s=120.0)
     assert run.exit_code == 0, run.output
     return run
@@ -124,10 +124,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found
 
 
-@pytest.fixture(scope="module")
-def virtual_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@pytest.fixture(scope="module", params=BACKENDS)
+def virtual_run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Of physics that runs by itself, ticks and losses, in virtual time."""
-    found = recorded(tmp_path_factory.mktemp("run"), *VIRTUAL)
+    found = recorded(tmp_path_factory.mktemp("run"), *VIRTUAL, "--backend", request.param)
     assert found.run_folder is not None
     brain = found.record["nodes"]["brain"]["hooks"]["think"]["executions"]
     assert 10 < brain < found.connection("robot.angle -> brain.angle")["sent"] - 5
