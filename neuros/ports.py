@@ -244,10 +244,10 @@ class VirtualRun(EventLoop, Protocol):
         """Call ``event`` so long after time 0, before anything else happens at that time."""
 
 
-class Voice(Protocol):
+class StatePublisher(Protocol):
     """Publishes the state of a launcher to its peers."""
 
-    def say(self, text: str) -> None:
+    def publish(self, text: str) -> None:
         """Publish the state, also for later subscribers. Any thread."""
 
     def close(self) -> None:
@@ -294,7 +294,7 @@ class Middleware(Protocol):
         names: Sequence[str],
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
-    ) -> Voice:
+    ) -> StatePublisher:
         """Publish the state of the nodes ``names``, and subscribe to that of nodes elsewhere.
 
         ``heard`` is called from any thread with a node and its state; ``None``: the node has ended.

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from neuros.engine.hook import Hook, Source
 from neuros.engine.input_queue import Subscription
 from neuros.engine.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, State
-from neuros.engine.node_ports import Links, NodePorts, PacketType, undeclared
+from neuros.engine.node_ports import Links, NodePorts, PacketType
 from neuros.engine.schedule import FIRST_TURN, ExecutionLog, Lifecycle, Pause, Schedule
 from neuros.engine.send_window import SendWindow
 from neuros.engine.sim_clock import ClockSubscription
@@ -191,7 +191,7 @@ class Engine:
         if source is None:
             for name in names:
                 if name not in self.outputs:
-                    text = undeclared("output", name, self.outputs, self.node)
+                    text = "{} ({})".format(*self.node.undeclared("output", name))
                     raise HookError(text, hook="submit", where=str(self.node.plugin))
             source = self._sources[names] = Source(names, self.outputs, str(self.node.plugin))
             self._lifecycle.add_source(source)

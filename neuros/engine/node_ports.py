@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from neuros.engine.input_queue import HookInput, Subscription
@@ -139,18 +139,14 @@ class NodePorts:
         ):
             for port in ports:
                 if port.name not in known:
-                    text = undeclared(kind, port.name, known, self._node)
+                    text = "{} ({})".format(*self._node.undeclared(kind, port.name))
                     raise HookError(text, hook=spec.name, where=spec.where)
         found: list[HookInput] = []
         for port in spec.inputs:
             feeding = [s for s in self.subscriptions.values() if s.input_name == port.name]
             if not feeding and not port.is_optional:
-                raise HookError(
-                    f"needs input '{port.name}', but nothing is connected to"
-                    f" {self._node.name}.{port.name}: connect it, or declare it Optional",
-                    hook=spec.name,
-                    where=spec.where,
-                )
+                text = ": ".join(self._node.unfed(port.name))
+                raise HookError(text, hook=spec.name, where=spec.where)
             if spec.sim_period_s is not None and self._is_clock(port.name):
                 period_s = spec.sim_period_s
                 found.append(TickInput(port, feeding, period_s, self._clock, self.sim_clock))
@@ -169,9 +165,3 @@ class NodePorts:
 
     def _is_clock(self, input_name: str) -> bool:
         return self._node.clock is not None and self._node.clock.name == input_name
-
-
-def undeclared(kind: str, name: str, known: Iterable[str], node: Node) -> str:
-    """The message for a port that a node does not have."""
-    has = ", ".join(sorted(known)) or "none"
-    return f"node '{node.name}' declares no {kind} '{name}' (it has {has})"

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import neuros.control as control
 from neuros.control import Message
-from neuros.ports import Middleware, Voice
+from neuros.ports import Middleware, StatePublisher
 
 _LEAVE_S = 4.0
 
@@ -31,7 +31,7 @@ class PeerLink:
         self._elsewhere = [name for name in elsewhere.split(",") if name]
         self._tell = tell
         self._lock = threading.Lock()
-        self._voice: Voice | None = None
+        self._publisher: StatePublisher | None = None
         self._last_state = ""
         self._may_leave = threading.Event()
 
@@ -39,18 +39,18 @@ class PeerLink:
         """Publish and receive states from now on."""
         if not self._elsewhere:
             return
-        voice = middleware.join_peers(self._names, self._elsewhere, self._receive)
+        publisher = middleware.join_peers(self._names, self._elsewhere, self._receive)
         with self._lock:
-            self._voice = voice
+            self._publisher = publisher
             if self._last_state:
-                voice.say(self._last_state)
+                publisher.publish(self._last_state)
 
     def publish(self, text: str) -> None:
         """Publish a state of the launcher, as soon as that is possible. Any thread."""
         with self._lock:
             self._last_state = text
-            if self._voice is not None:
-                self._voice.say(text)
+            if self._publisher is not None:
+                self._publisher.publish(text)
 
     def leave(self) -> None:
         """The launcher has published and received all states. Any thread."""
@@ -58,12 +58,12 @@ class PeerLink:
 
     def close(self) -> None:
         """Wait until :meth:`leave`, but not for ever, and publish nothing more."""
-        if self._voice is None:
+        if self._publisher is None:
             return
         self._may_leave.wait(_LEAVE_S)
         with self._lock:
-            voice, self._voice = self._voice, None
-        voice.close()
+            publisher, self._publisher = self._publisher, None
+        publisher.close()
 
     def _receive(self, name: str, text: str | None) -> None:
         self._tell(control.StateOfPeer(name, text))

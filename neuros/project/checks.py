@@ -496,23 +496,15 @@ def _misfits(
             if port.name is None or "" in names:
                 continue
             if port.name not in names:
-                hint = did_you_mean(port.name, names)
+                text, hint = node.undeclared(side, port.name)
+                hint = did_you_mean(port.name, names) or hint
                 if port.name in other_names:
                     hint = f"it has an {'output' if side == 'input' else 'input'} of that name"
-                hint = hint or f"it has {', '.join(sorted(names)) or 'none'}"
-                text = f"hook '{hook.name}': node '{node.name}' declares no {side} '{port.name}'"
-                yield Remark(port.line, port.column, text, hint)
-            elif (
-                side == "input"
-                and not port.is_optional
-                and not _is_fed(node, port.name, connections)
-            ):
-                text = (
-                    f"hook '{hook.name}': needs input '{port.name}', but nothing is connected to"
-                    f" {node.name}.{port.name}"
-                )
-                hint = "connect it, or declare it Optional"
-                yield Remark(port.line, port.column, text, hint)
+            elif side == "output" or port.is_optional or _is_fed(node, port.name, connections):
+                continue
+            else:
+                text, hint = node.unfed(port.name)
+            yield Remark(port.line, port.column, f"hook '{hook.name}': {text}", hint)
 
 
 def _is_fed(node: Node, name: str, connections: Sequence[Connection] | None) -> bool:

@@ -214,6 +214,17 @@ class Node:
             return text, "write batch=True in its decorator: its arrays have a leading axis"
         return "", ""
 
+    def undeclared(self, side: str, name: str) -> tuple[str, str]:
+        """The error of a hook with a port (``side``: input, output) that is not here; a hint."""
+        ports = self.inputs if side == "input" else self.outputs
+        has = ", ".join(sorted(port.name for port in ports)) or "none"
+        return f"node '{self.name}' declares no {side} '{name}'", f"it has {has}"
+
+    def unfed(self, name: str) -> tuple[str, str]:
+        """The error of a hook that requires an input to which nothing is connected; a hint."""
+        text = f"needs input '{name}', but nothing is connected to {self.name}.{name}"
+        return text, "connect it, or declare it Optional"
+
     @property
     def no_clock(self) -> tuple[str, str]:
         """The error of a hook that needs a clock in a node without one, and a hint."""

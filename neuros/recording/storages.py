@@ -227,12 +227,15 @@ class McapFile:
         connections: dict[str, Connection] = {}
         for channel in known.channels.values():
             schema = known.schemas.get(channel.schema_id)
+            definition = _NO_DEFINITION
+            if schema is not None:  # that of another encoding may be no text
+                definition = _definition(schema.encoding, schema.data.decode(errors="replace"))
             made = connection(
                 channel.id,
                 names[channel.id],
                 schema.name if schema else _UNKNOWN,
                 channel.message_encoding or _UNKNOWN,
-                _definition(schema.encoding, schema.data.decode()) if schema else _NO_DEFINITION,
+                definition,
                 counts.get(channel.id, 0),
                 channel.metadata.get("offered_qos_profiles", ""),
             )

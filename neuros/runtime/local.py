@@ -22,7 +22,7 @@ from dataclasses import replace
 from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neuros.ports import Inbox, Logger, NodeEvents, Transport, TransportKind, Voice
+from neuros.ports import Inbox, Logger, NodeEvents, StatePublisher, Transport, TransportKind
 from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.project.names import SESSION
 from neuros.project.timing import VIRTUAL
@@ -502,7 +502,7 @@ class LocalMiddleware:
         names: Sequence[str],
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
-    ) -> Voice:
+    ) -> StatePublisher:
         return self._with_ros().join_peers(names, elsewhere, heard)
 
     def take_in(self) -> None:

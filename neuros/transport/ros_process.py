@@ -140,9 +140,9 @@ class RosProcess:
         names: Sequence[str],
         elsewhere: Sequence[str],
         heard: Callable[[str, str | None], None],
-    ) -> PeerVoice:
+    ) -> PeerStatePublisher:
         namespace = self._files[0].names.namespace
-        return PeerVoice(names, elsewhere, self._context, heard, namespace)
+        return PeerStatePublisher(names, elsewhere, self._context, heard, namespace)
 
     def take_in(self) -> None:
         """Handle what had arrived when the loop ended, but for callbacks of plugins."""
@@ -179,7 +179,7 @@ class RosProcess:
 # ---------------------------------------------------------------------- peers
 
 
-class PeerVoice:
+class PeerStatePublisher:
     """Publishes the state of this launcher for its nodes, and receives that of nodes elsewhere.
 
     It has a thread of its own.
@@ -233,7 +233,7 @@ class PeerVoice:
         self._thread = threading.Thread(target=self._listen, name="neuros-peers", daemon=True)
         self._thread.start()
 
-    def say(self, text: str) -> None:
+    def publish(self, text: str) -> None:
         """Publish a state, also for launchers that come later. Any thread."""
         for publisher in self._publishers:
             publisher.publish(String(data=text))

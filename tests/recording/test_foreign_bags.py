@@ -308,6 +308,34 @@ class TestTypes:
             with pytest.raises(EnvironmentFault, match="/odd cannot be decoded: its packets are"):
                 bag["/odd"].array()
 
+    def test_topics_that_are_not_of_ros_fail_alone(self, tmp_path: Path) -> None:
+        """As other programs mix them in a file: JSON, Protobuf, and channels without schema."""
+        with (tmp_path / "a.mcap").open("wb") as file:
+            writer = McapWriter(file)
+            writer.start()
+            schemas = [
+                ("/json", "json", writer.register_schema("Pose", "jsonschema", b"{}")),
+                ("/protobuf", "protobuf", writer.register_schema("x.P", "protobuf", b"\x0a\xff")),
+                ("/plain", "", 0),
+                ("/height", "cdr", writer.register_schema(KIND, "ros2msg", b"float64 data")),
+            ]
+            for topic, encoding, schema in schemas:
+                channel = writer.register_channel(topic, encoding, schema)
+                for time_ns, packet in zip(TIMES, PACKETS, strict=True):
+                    writer.add_message(channel, time_ns, packet, time_ns)
+            writer.finish()
+        check(tmp_path / "a.mcap")
+        with neuros.bag.open(tmp_path / "a.mcap") as bag:
+            assert {name: topic.type for name, topic in bag.topics.items()} == {
+                "/json": "Pose",
+                "/protobuf": "x.P",
+                "/plain": "unknown",
+                "/height": KIND,
+            }
+            assert {*bag.undecodable()} == {"/json", "/protobuf", "/plain"}
+            with pytest.raises(EnvironmentFault, match="/json cannot be decoded: its packets are"):
+                bag["/json"].array()
+
     @pytest.mark.parametrize(
         ("encoding", "text"),
         [

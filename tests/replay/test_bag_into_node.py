@@ -146,10 +146,10 @@ def test_it_ends_where_the_node_ends_the_project(
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (("--remap", "/h:=brain.height"), "--remap needs the node that gets the packets: --node"),
+        (("--remap", "/h:=brain.height"), "--remap needs the node that gets the packets: one"),
         (("--node", "brain", "--remap", "/h=brain.height"), "write TOPIC:=NODE.PORT, as /camera"),
         (("--node", "brain", "--remap", "/h:=height"), "write TOPIC:=NODE.PORT"),
-        ((*TO_BRAIN, *TO_BRAIN), "/camera/image goes to robot.eye already"),
+        ((*TO_BRAIN, *TO_BRAIN[2:]), "/camera/image goes to robot.eye already"),
         ((*TO_BRAIN, "--pdb"), "--remap takes neither --pdb, --debugpy nor --topic"),
         ((*TO_BRAIN, "-p", "nowhere"), "there is no project nowhere: name it with --project"),
         (("--node", "brian", "--remap", "/h:=brian.height"), "has no node 'brian'"),
