@@ -244,6 +244,9 @@ class VirtualRun(EventLoop, Protocol):
     ) -> None:
         """Call ``on_end`` at the end of a duration from time 0; go no faster than the factor."""
 
+    def call_at(self, time_s: float, event: Callable[[], None]) -> None:
+        """Call ``event`` so long after time 0, before anything else happens at that time."""
+
 
 class StatePublisher(Protocol):
     """Publishes the state of a launcher to its peers."""
@@ -338,6 +341,10 @@ class TransportKind(ABC):
 
 WorldLook: TypeAlias = "Callable[[Mapping[str, Any], int], Mapping[str, Any]]"
 """A view of a simulated world, for JSON, by the observer's request and number. Any thread."""
+
+
+Changes: TypeAlias = "Mapping[str, tuple[Mapping[str, str], Mapping[str, Any]]]"
+"""By node, the variables of its environment and the parameters of its ROS node that change."""
 
 
 class VirtualClock(Protocol):

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 from neuros.api.loading import with_model_fields
 from neuros.errors import UsageError
+from neuros.ports import Changes
 from neuros.project.model import Project
 from neuros.project.suggest import did_you_mean
-
-Changes: TypeAlias = "Mapping[str, tuple[Mapping[str, str], Mapping[str, Any]]]"
-"""By node, the variables of its environment and the parameters of its ROS node that change."""
 
 _KINDS = (["environment"], ["parameters"])
 _WHAT = (

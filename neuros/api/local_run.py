@@ -20,7 +20,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar
 
-from neuros.api.changes import Changes
 from neuros.api.live import why_it_ended
 from neuros.api.plan import Plan
 from neuros.api.run import Run
@@ -37,6 +36,7 @@ from neuros.node.failures import callback_error
 from neuros.node.node import NodeRuntime
 from neuros.node.reports import declared
 from neuros.options import recorded_values
+from neuros.ports import Changes
 from neuros.project.loops import modules_beside
 from neuros.project.model import Node, NodeFile
 from neuros.project.plugin_files import read_plugin

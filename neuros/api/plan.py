@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
+import json
 import os
 import re
 import socket
@@ -25,7 +26,7 @@ from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError, printable
 from neuros.installation.progress import Progress, Stream
 from neuros.messages.needed import Messages
-from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Notice
+from neuros.ports import BackEnd, Changes, Deployment, Launcher, NodeProgram, Notice
 from neuros.project.model import Folders, Node, NodeFile, Project
 from neuros.project.names import SESSION
 from neuros.project.scanner import problem_in
@@ -126,6 +127,7 @@ class Plan:
         is_held: whether a session steps the run.
         restored: what nodes get back that their plugins have kept.
         fork: of which run it is a fork, for the record; empty: of none.
+        changes: in virtual time, its seconds, and what changes there.
     """
 
     project: Project
@@ -138,6 +140,7 @@ class Plan:
     is_held: bool = False
     restored: Sources = field(default_factory=dict)
     fork: Mapping[str, Any] = field(default_factory=dict)
+    changes: tuple[float, Changes] | None = None
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -225,6 +228,8 @@ class Plan:
             options += ["--duration", repr(end.wall_s)]
         if self.request.real_time_factor is not None:
             options += ["--real-time-factor", repr(self.request.real_time_factor)]
+        if self.changes is not None:
+            options += ["--fork", json.dumps(self.changes)]
         if self.back_end.is_one_process:
             options.append("--one-process")
         if end.sim_s is not None:

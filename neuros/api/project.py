@@ -30,6 +30,7 @@ from neuros.api.run import Run
 from neuros.errors import Problem, ProjectError, UsageError
 from neuros.messages.needed import Messages
 from neuros.options import option, takes
+from neuros.ports import Changes
 from neuros.project.graph import graph_mermaid, graph_text
 from neuros.project.in_python import PythonConnection, PythonNode, PythonProject
 from neuros.project.load import LoadedProject
@@ -334,6 +335,14 @@ class Project:
 
         return Session(self._preparer(options, lambda project: (project, ())), options.seed, fork)
 
+    def forked(
+        self, options: StartOptions, fork: Mapping[str, Any], changes: tuple[float, Changes]
+    ) -> Run:
+        """Run the project in virtual time to its end, with changes at a moment; as :meth:`run`."""
+        live = self._live(*self._load_for_run(options), options, fork=fork, changes=changes)
+        live.begin()
+        return live.wait()
+
     def _preparer(
         self, options: StartOptions, bind: Callable[[Described], tuple[Described, Sequence[str]]]
     ) -> Prepare:
@@ -396,6 +405,7 @@ class Project:
         *,
         is_held: bool = False,
         fork: Mapping[str, Any] | None = None,
+        changes: tuple[float, Changes] | None = None,
     ) -> LiveRun:
         for node in project.nodes:
             if not node.hooks:
@@ -406,7 +416,8 @@ class Project:
                     " the project with to_json(folder), and start that"
                 )
             PluginText(node.name, node.hooks)  # fails before there is a run folder
-        plan = replace(make_plan(project, messages, options), is_held=is_held, fork=fork or {})
+        plan = replace(make_plan(project, messages, options), is_held=is_held)
+        plan = replace(plan, fork=fork or {}, changes=changes)
         if is_held and project.is_virtual and not plan.back_end.is_one_process:
             raise UsageError(
                 f"backend: a session cannot hold nodes of the back end {plan.back_end.name} in"

@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from neuros.api.changes import Changes, changes_of
+from neuros.api.changes import changes_of
 from neuros.api.live import PROGRAM_FAILED, why_it_ended
 from neuros.api.loading import seed_variables, value_text, with_model_fields
 from neuros.api.run import Run
@@ -40,6 +40,7 @@ from neuros.api.session_link import (
 from neuros.control import AtRest, NodeStatus
 from neuros.errors import NeurosError, RunError, UsageError
 from neuros.node.instruments import room_for
+from neuros.ports import Changes
 from neuros.project.graph import graph_svg
 from neuros.project.model import Node, Port, Project
 from neuros.project.repeatable import why_not_repeatable
@@ -103,6 +104,7 @@ class Session:
         self._seed = seed
         self._is_forkable = is_forkable
         self._journal: list[tuple[str, tuple[Any, ...]]] = []  # what a fork does again
+        self._unnoted = 0  # and then so many rounds
         self._why_no_fork = ""
         self._lock = threading.RLock()
         self._outputs: dict[str, _Received] = {}
@@ -133,7 +135,7 @@ class Session:
             received.begin_anew()
         self._known = dict.fromkeys(self._outputs, 0)
         self._sim_times: Mapping[str, float] = {}
-        self._journal = []
+        self._journal, self._unnoted = [], 0
         self._why_no_fork = ""
 
     # ------------------------------------------------------------------ time
@@ -185,6 +187,7 @@ class Session:
                 return False
             is_counted = sim_s is None and until is None
             for _ in range(count) if is_counted else self._rounds(sim_s, until):
+                self._unnoted += 1
                 if not self._take(self._held.advance(1, self._known, end_s)):
                     return False
             return self.is_running  # `until` may have closed it
@@ -211,7 +214,12 @@ class Session:
             if duration_s is None:
                 return self._run_sim(check_seconds(duration_sim_s=duration_sim_s))
             duration_s = check_seconds(duration_s=duration_s)
-            self._why_no_fork = "it ran for a wall time (run(duration_s=...)): use duration_sim_s"
+            if self._project.is_virtual:
+                self._note("run", duration_s)
+            else:
+                self._why_no_fork = (
+                    "it ran for a wall time (run(duration_s=...)): use duration_sim_s"
+                )
             return self._take(self._held.run_for(duration_s, self._known))
 
     def reset(
@@ -294,7 +302,8 @@ class Session:
                 set or {},
                 lambda more: self._prepare(self._seed, {**self._latest, **more}).project,
             )
-            counts, journal = self.sent_counts(), [*self._journal]
+            counts = self.sent_counts()
+            journal = [*self._journal, ("advance", (self._unnoted, None))]
             about = {
                 "run": str(self.folder),
                 "at_sim_s": self.sim_time,
@@ -312,6 +321,8 @@ class Session:
             for what, arguments in journal:
                 if what == "advance":
                     other._advance(arguments[0], None, arguments[1])
+                elif what == "run":
+                    other.run(duration_s=arguments[0])
                 elif what == "send":
                     other._held.deliver(*arguments)
                     other._note(what, *arguments)
@@ -362,11 +373,10 @@ class Session:
 
     def _note(self, name: str, *arguments: Any) -> None:
         """Remember what a fork has to do again."""
-        last = self._journal[-1] if self._journal else ("", ())
-        if name == last[0] == "advance" and arguments[1] is last[1][1] is None:
-            self._journal[-1] = name, (arguments[0] + last[1][0], None)
-        else:
-            self._journal.append((name, arguments))
+        if self._unnoted:
+            self._journal.append(("advance", (self._unnoted, None)))
+            self._unnoted = 0
+        self._journal.append((name, arguments))
 
     def _kept(self, asked: bool | str | Sequence[str]) -> dict[str, list[str]]:
         """The names of the values that a reset keeps, by node."""
@@ -600,7 +610,9 @@ class Session:
         self, rounds: int, end_s: float | None = None, end_sim_s: float | None = None
     ) -> bool:
         """Go on by rounds, and wait until nothing moves; whether the run goes on."""
-        if rounds:
+        if end_sim_s is None:
+            self._unnoted += rounds
+        else:
             self._note("advance", rounds, end_sim_s)
         return self._take(self._held.advance(rounds, self._known, end_s, end_sim_s))
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from neuros.api.changes import Changes
 from neuros.api.live import LiveRun
 from neuros.api.run import Run
 from neuros.backends.control_sockets import connect
@@ -32,6 +31,7 @@ from neuros.control import (
 from neuros.control.link import Arrivals, ControlLink, decode, decoder_of
 from neuros.errors import ControlError, UsageError
 from neuros.node.node import LAST_PACKETS
+from neuros.ports import Changes
 from neuros.project.model import Node, Port, Project
 from neuros.project.names import SESSION
 from neuros.project.scanner import display_name, place_of, read_bytes

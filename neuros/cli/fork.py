@@ -25,8 +25,8 @@ def add_fork(fork: argparse.ArgumentParser) -> None:
         "--at",
         required=True,
         metavar="TIME",
-        help="the moment, in simulated seconds: 12.4sim; it is the end of the round in which the"
-        " simulated time is reached",
+        help="the moment, in simulated seconds: 12.4sim (the end of the round in which that time is"
+        " reached); of a run in virtual time, in seconds of its clock: 12.4",
     )
     add(
         "--set",
@@ -48,15 +48,15 @@ def add_fork(fork: argparse.ArgumentParser) -> None:
 
 def _fork(options: argparse.Namespace) -> int:
     from neuros.api.changes import settings_of
-    from neuros.api.forking import fork_run, sim_seconds
+    from neuros.api.forking import fork_run, moment
     from neuros.cli.environments import signals_interrupt
 
-    at_sim_s = sim_seconds(options.at)
+    at_s, _ = moment(options.at)
     settings = settings_of(options.set)
     with signals_interrupt([]):
         forked = fork_run(
             options.run.absolute(),
-            at_sim_s,
+            options.at,
             settings,
             output=options.output,
             backend=options.backend,
@@ -64,7 +64,7 @@ def _fork(options: argparse.Namespace) -> int:
             show=True,
         )
     if forked.difference:
-        print(f"different before {at_sim_s:g} s: {forked.difference}")
+        print(f"different before {at_s:g} s: {forked.difference}")
         return forked.run.exit_code or EXIT_DIFFERENT
-    print(f"identical up to {at_sim_s:g} s: {counted(forked.compared, 'packet')}")
+    print(f"identical up to {at_s:g} s: {counted(forked.compared, 'packet')}")
     return forked.run.exit_code

@@ -30,6 +30,7 @@ def add_node(node: argparse.ArgumentParser) -> None:
     node.add_argument("--duration-sim", type=float)
     node.add_argument("--duration", type=float)
     node.add_argument("--real-time-factor", type=float)
+    node.add_argument("--fork", type=json.loads)
     node.add_argument("--digests", action="store_true")
     node.add_argument("--debug", action="store_true")
     node.add_argument("--record", action="store_true")
@@ -87,6 +88,7 @@ def _run_node(options: argparse.Namespace) -> int:
         duration_sim_s=options.duration_sim,
         duration_s=options.duration,
         real_time_factor=options.real_time_factor,
+        fork=options.fork,
         is_held=options.held,
         own_logs=options.one_process,
     ).run()

@@ -29,7 +29,7 @@ from neuros.node.node import NodeRuntime
 from neuros.node.peer_link import PeerLink
 from neuros.node.reports import declared
 from neuros.node.saving import Saving
-from neuros.ports import ControlStream, Middleware, PacketRecorder, VirtualRun
+from neuros.ports import Changes, ControlStream, Middleware, PacketRecorder, VirtualRun
 from neuros.project.model import Connection, NodeFile
 from neuros.project.timing import VIRTUAL
 from neuros.stacks import allow_reading
@@ -61,6 +61,8 @@ class NodeProcess:
         duration_sim_s: simulated time after which the node that owns it ends the project.
         duration_s: virtual time after which the project ends.
         real_time_factor: seconds of virtual time per second of the machine, at most.
+        fork: seconds of virtual time, and what changes there: by node, variables of its
+            environment and parameters.
         is_held: whether nodes stand still from the start, for a session.
         own_logs: whether each node writes to a log file of its own (several nodes share the
             process), rather than to the output that the process was started with.
@@ -76,12 +78,14 @@ class NodeProcess:
         duration_sim_s: float | None = None,
         duration_s: float | None = None,
         real_time_factor: float | None = None,
+        fork: tuple[float, Changes] | None = None,
         is_held: bool = False,
         own_logs: bool = False,
     ) -> None:
         self._files = files
         self._duration_s = duration_s
         self._real_time_factor = real_time_factor
+        self._fork = fork
         self._make_middleware = make_middleware
         self._connect = connect
         self._open_recorder = open_recorder
@@ -163,6 +167,7 @@ class NodeProcess:
         match message:
             case control.Activate():
                 self._reach(ProcessStage.ACTIVE)
+                self._change(only_checks=True)
                 for node in nodes:
                     node.activate()
                 for node in nodes:
@@ -315,6 +320,8 @@ class NodeProcess:
             if self._files[0].time == VIRTUAL:
                 loop = cast(VirtualRun, middleware.loop)
                 loop.plan(self._duration_s, self._end_by_duration, self._real_time_factor)
+                if self._fork is not None:
+                    loop.call_at(self._fork[0], functools.partial(self._change, only_checks=False))
             with self._early_lock:
                 self._middleware = middleware
                 for event in self._early_events:
@@ -347,6 +354,12 @@ class NodeProcess:
         self.report()
         for node in self._nodes.values():
             node.start(awaits_others=True)
+
+    def _change(self, *, only_checks: bool) -> None:
+        """Make the changes of a fork, or check them."""
+        for name, (variables, parameters) in (self._fork or (0.0, {}))[1].items():
+            if name in self._nodes:
+                self._nodes[name].change(variables, parameters, only_checks=only_checks)
 
     def _end_by_duration(self) -> None:
         reason = f"{self._duration_s:g} s of virtual time have passed"

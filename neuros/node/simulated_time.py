@@ -66,7 +66,11 @@ class SimulatedTime:
         return None if self.clock.now_ns is None else self.clock.now_ns / 1e9
 
     def stamp(self, reading: Callable[[int], int]) -> Any:
-        """A stamp of now: simulated where the node owns time or has a clock, else wall time."""
+        """A stamp of now: simulated where the node owns time or has a clock, else wall time.
+
+        Args:
+            reading: what is read of the wall clock, by what it says (:meth:`Engine.reading`).
+        """
         if self._read_s is not None:
             return to_stamp(self._read_s())
         if self._has_clock or self.is_watched:

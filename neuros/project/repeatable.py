@@ -1,4 +1,4 @@
-"""Whether a project does the same again in real time, as far as its files and plugins tell.
+"""Whether a project does the same again, as far as its files and plugins tell.
 
 ``docs/deterministic_runs.md`` has the conditions.
 """
@@ -19,6 +19,8 @@ def why_not_repeatable(project: Project, *, is_stepped: bool = False) -> list[st
         is_stepped: whether all nodes are in the thread of a program that steps them: then only
             threads of plugins are left.
     """
+    if project.is_virtual:  # what cannot be repeated there is refused at the start
+        return []
     return [*_threads(project), *(() if is_stepped else _outside(project))]
 
 

@@ -10,7 +10,7 @@ import pdb
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -30,6 +30,7 @@ from neuros.node.context import ContextSwitch
 from neuros.node.node import NodeRuntime
 from neuros.ports import Advance, Inbox, Way
 from neuros.project.model import Connection, NodeFile
+from neuros.project.timing import REAL
 from neuros.replay.recorded_node import RecordedNode
 from neuros.runtime.local import LocalLoop, LocalMiddleware, NoTopics
 from neuros.transport.envelope import Traffic
@@ -178,6 +179,7 @@ class ReplayedNode:
     """
 
     def __init__(self, file: NodeFile, recorded: RecordedNode) -> None:
+        file = replace(file, time=REAL)  # its clock is that of the event log
         self._file, self._recorded = file, recorded
         self._script = Script(recorded.event_log)
         self._loop = _Loop(self._script)

@@ -204,6 +204,7 @@ class VirtualLoop(LocalLoop):
         self.waits_for_rest = True
         self.limit_ns: int | None = None
         self._on_limit: list[Event] = []
+        self._calls: list[tuple[int, Event]] = []
         self._end: tuple[int, str, int] | None = None  # time, node that asked, time to drain
         self.connections: set[Connection] = set()
 
@@ -265,6 +266,10 @@ class VirtualLoop(LocalLoop):
         self._duration = None if duration_s is None else (round(duration_s * 1e9), on_end)
         self._factor = real_time_factor
 
+    def call_at(self, time_s: float, event: Event) -> None:
+        """Call ``event`` so long after time 0, before anything else happens at that time."""
+        self._calls.append((round(time_s * 1e9), event))
+
     def end(self, name: str, drain_s: float) -> None:
         """A node asks for the end, or nobody (``""``): what comes later than now waits.
 
@@ -313,6 +318,9 @@ class VirtualLoop(LocalLoop):
             return False
         if limit_ns is not None and time_ns >= limit_ns:
             return self._come_to_limit(limit_ns)
+        if self._calls and not self.waits_for_rest and time_ns >= self.zero_ns + self._calls[0][0]:
+            self._calls.pop(0)[1]()
+            return True
         if self._factor is not None and not self._is_due(time_ns):
             return True
         _, place = heappop(self._next)

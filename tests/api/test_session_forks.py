@@ -196,6 +196,7 @@ def test_a_fork_begins_with_the_last_reset_and_its_settings(tmp_path: Path) -> N
 moves = st.lists(
     st.one_of(
         st.tuples(st.just("step"), st.integers(1, 4)),
+        st.tuples(st.just("until"), st.integers(1, 3)),
         st.tuples(st.just("send"), st.integers(-5, 5)),
         st.tuples(st.just("look"), st.just(0)),
     ),
@@ -208,6 +209,9 @@ def play(s: Session, done: list[tuple[str, int]]) -> list[float]:
     for what, number in done:
         if what == "step":
             found += sums(s, number)
+        elif what == "until":
+            count = s["grower.sum"].count + number
+            s.step(until=lambda s, count=count: s["grower.sum"].count >= count)
         elif what == "send":
             s.send("grower.more", Float64(data=float(number)))
         else:
@@ -226,6 +230,18 @@ def test_whatever_was_done_a_fork_does_then_what_the_session_does(
         play(s, before)
         with s.fork() as other:
             assert play(other, after) == play(s, after)
+
+
+def test_in_virtual_time_a_session_that_ran_for_a_time_is_forked(tmp_path: Path) -> None:
+    project = described(tmp_path, limit=None)
+    times = {"nodes.grower.durations": {"grow": {"uniform": [0.01, 0.03]}}}
+    with project.session(time="virtual", set=times) as s:
+        s.run(duration_s=0.5)
+        with s.fork() as other:
+            assert other["grower.sum"].count == s["grower.sum"].count > 10
+            for each in (s, other):
+                each.run(duration_s=0.3)
+            assert other["doubler.twice"].packet == s["doubler.twice"].packet
 
 
 # ------------------------------------------------------------------ refused

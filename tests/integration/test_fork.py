@@ -54,11 +54,36 @@ def think(node, angle):
     torque.data = float(os.environ["GAIN"]) * (0.3 - angle.data)
     return torque
 """
+RUNS_BY_ITSELF = (
+    ROBOT[: ROBOT.index("@neuros_init")]
+    + """\
+from neuros.hooks import neuros_tick
+
+
+@neuros_initialise()
+def begin(node):
+    sim = MuJoCo(node, WORLD)
+    node.set_user_data(sim)
+    sim.run_asynchronous(1.0)
+
+
+@neuros_function(inputs="torque")
+def obey(node, torque):
+    node.get_user_data().actuate("m", torque.data)
+
+
+@neuros_tick(0.013)
+def watch(node):
+    if node.get_user_data().sim_time > float(os.environ["END"]):
+        node.shutdown("done")
+"""
+)
 RATE_HZ = 50
+VIRTUAL = ("--time", "virtual")
 
 
-def write_project(folder: Path) -> Path:
-    """A strict loop of a swinging body and its controller."""
+def write_project(folder: Path, *, is_strict: bool = True) -> Path:
+    """A loop of a swinging body and its controller: strict, or one that may lose packets."""
     folder.mkdir()
     (folder / "robot.py").write_text(ROBOT)
     (folder / "brain.py").write_text(BRAIN)
@@ -72,17 +97,22 @@ def write_project(folder: Path) -> Path:
     brain |= {"environment": {"GAIN": 1}}
     wires = [("robot", "angle", "brain"), ("brain", "torque", "robot")]
     keys = ("source_node", "source_output", "destination_node", "destination_input")
+    limit = {"discard_limit": 0} if is_strict else {}
     connections = [
-        {**dict(zip(keys, (a, port, b, port), strict=True)), "discard_limit": 0}
-        for a, port, b in wires
+        {**dict(zip(keys, (a, port, b, port), strict=True)), **limit} for a, port, b in wires
     ]
+    if not is_strict:
+        (folder / "robot.py").write_text(RUNS_BY_ITSELF)
+        brain["durations"] = {"think": {"uniform": [0.005, 0.06]}}
+        brain["environment"]["SEED"] = 3
     project = {"nodes": [robot, brain], "connections": connections}
     (folder / "project.json").write_text(json.dumps(project))
     return folder
 
 
 def recorded(folder: Path, *options: str) -> Finished:
-    run = launch(write_project(folder / "project"), *options, "-r", cwd=folder, timeout_s=120.0)
+    project = write_project(folder / "project", is_strict=VIRTUAL[1] not in options)
+    run = launch(project, *options, "-r", cwd=folder, timeout_s=120.0)
     assert run.exit_code == 0, run.output
     return run
 
@@ -92,6 +122,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = recorded(tmp_path_factory.mktemp("run"), "--backend", "process").run_folder
     assert found is not None
     return found
+
+
+@pytest.fixture(scope="module", params=BACKENDS)
+def virtual_run(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of physics that runs by itself, ticks and losses, in virtual time."""
+    found = recorded(tmp_path_factory.mktemp("run"), *VIRTUAL, "--backend", request.param)
+    assert found.run_folder is not None
+    brain = found.record["nodes"]["brain"]["hooks"]["think"]["executions"]
+    assert 10 < brain < found.connection("robot.angle -> brain.angle")["sent"] - 5
+    return found.run_folder
 
 
 @pytest.fixture
@@ -140,6 +180,49 @@ def test_a_changed_fork_differs_only_after_its_time(
     found = re.search(r"different: .*: packet (\d+) differs", verdict.stdout)
     assert found is not None
     assert int(found[1]) >= 0.5 * RATE_HZ + 1
+
+
+def test_in_virtual_time_an_unchanged_fork_is_identical_to_its_end(
+    virtual_run: Path, tmp_path: Path
+) -> None:
+    done = fork(virtual_run, tmp_path / "fork", "--at", "0.5")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert re.search(r"^identical up to 0\.5 s: [2-9]\d packets$", done.stdout, re.M), done.stdout
+    verdict = neuros("verify", virtual_run, tmp_path / "fork")
+    assert verdict.returncode == 0, verdict.stdout
+    assert neuros("replay", tmp_path / "fork").returncode == 0
+
+
+@pytest.mark.parametrize(
+    "setting", ["nodes.brain.environment.GAIN=3", "robot.model.dof_damping=0.5"]
+)
+def test_in_virtual_time_a_changed_fork_differs_only_after_its_time(
+    virtual_run: Path, tmp_path: Path, setting: str
+) -> None:
+    done = fork(virtual_run, tmp_path / "fork", "--at", "0.5", "--set", setting)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "identical up to 0.5 s: " in done.stdout
+    verdict = neuros("verify", virtual_run, tmp_path / "fork")
+    assert verdict.returncode == 1, verdict.stdout
+    record = json.loads((tmp_path / "fork/run.json").read_text())
+    assert record["fork"]["at_s"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--at", "0.5sim"], "it is in virtual time: give seconds of virtual time, as in 12.4"),
+        (["--at", "9"], "s of its clock: fork it before"),
+        (["--at", "0.5", "--set", "robot.model.dof_dampin=1"], "no field 'dof_dampin'"),
+    ],
+)
+def test_what_users_mistype_of_virtual_time(
+    virtual_run: Path, tmp_path: Path, options: list[str], says: str
+) -> None:
+    done = fork(virtual_run, tmp_path / "fork", *options)
+    assert done.returncode in (1, 2), done.stdout + done.stderr
+    assert says in done.stderr
+    assert "identical" not in done.stdout
 
 
 def test_the_record_tells_what_it_is_a_fork_of(run: Path, tmp_path: Path) -> None:
@@ -211,7 +294,7 @@ def test_all_reasons_are_named_at_once(own: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--at", "0.5"], "--at 0.5: give simulated seconds above 0, such as 12.4sim"),
+        (["--at", "0.5"], "--at 0.5: it is in real time: give simulated seconds, as in 12.4sim"),
         (["--at", "soon"], "--at soon: give simulated seconds"),
         (["--at", "0sim"], "--at 0sim: give simulated seconds above 0"),
         ([], "name it on the command line, it is missing: --at"),

@@ -190,9 +190,9 @@ def test_as_json(recorded: Recorded) -> None:
     assert (verdict["difference"], verdict["notes"], answer["notes"]) == ("", [], [])
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("options", ["process", "in-process", "in-process --time virtual"])
 def test_physics_that_runs_by_itself_is_where_the_hooks_saw_it(
-    backend: str, tmp_path: Path
+    options: str, tmp_path: Path
 ) -> None:
     """Commands, readings of its state and its time, and packets that left without a hook."""
     float_type = "std_msgs/msg/Float64"
@@ -208,7 +208,7 @@ def test_physics_that_runs_by_itself_is_where_the_hooks_saw_it(
     ]
     project = {"nodes": [physics, pusher], "connections": wires}
     plugins = {"physics": PHYSICS, "pusher": PUSHER}
-    run = run_of(tmp_path, project, plugins, "--backend", backend)
+    run = run_of(tmp_path, project, plugins, "--backend", *options.split())
     done = replay_run(run)
     assert done.returncode == 0, done.stdout + done.stderr
     assert int(rows(done.stdout)["physics"][1]) > 100
