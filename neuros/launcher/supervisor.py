@@ -267,6 +267,7 @@ class Supervisor:
         now_s = time.monotonic()
         match message:
             case Report():
+                self._extend_drain(message, now_s)
                 self.outcome.add(message, now_s)
                 self._detector.report(message, now_s)
                 self._backlog.report(message, now_s)
@@ -493,6 +494,13 @@ class Supervisor:
         self._peers.drain(reason, drain_s)
         self._channels.send(control.Drain(self._declarations.last_round(stopped), is_asked))
         self._probing.drain(self._processes.killed, now_s)
+
+    def _extend_drain(self, report: Report, now_s: float) -> None:
+        """In virtual time, nodes know how long they may drain; here, whether they get on."""
+        last = self.outcome.reports.get(report.node)
+        if self.phase is Phase.DRAINING and report.virtual_s is not None:
+            if last is None or last.virtual_s is None or report.virtual_s > last.virtual_s:
+                self._deadline_s = max(self._deadline_s, now_s + _DRAIN_S)
 
     def _tick_draining(self, now_s: float) -> None:
         if self._probing.check(now_s, 0.0) is Verdict.DRAINED:

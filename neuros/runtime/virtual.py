@@ -18,7 +18,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from typing import Any
 
 from neuros.ports import Transport
@@ -95,6 +95,12 @@ class NodeTime:
         """A hook that started now takes so long."""
         self.now_ns += duration_ns
         self.starts = 0 if duration_ns else self.starts + 1
+        if duration_ns and any(each[1] == _LOOP_BACK for each in self._events):
+            # A loop-back comes after what arrives while the hook holds the node.
+            self._events = [
+                (self.now_ns, *each[1:]) if each[1] == _LOOP_BACK else each for each in self._events
+            ]
+            heapify(self._events)
 
     # ------------------------------------------------------------------ for others
 

@@ -76,7 +76,8 @@ class RosNodeTime(NodeTime):
 
     def hold(self, duration_ns: int) -> None:
         super().hold(duration_ns)
-        self.post_loop_back(_end_of_hold)
+        if duration_ns:
+            self.post_loop_back(_end_of_hold)
 
     def ready(self) -> None:
         self._loop.is_ready = True
