@@ -91,7 +91,8 @@ def fork_run(
         run = project.forked(chosen, about, (at_s, changes))
         if (run.record.get("virtual_s") or 0.0) < at_s:
             raise RunError(f"the fork ended before {at_s:g} s: {run.reason}", 1)
-        counts = {name: _sent_before(run, name, at_s) for name in run.connections}
+        sent_ns = {name: read_packets(run.folder, ends).sent_ns for name, ends in run.ends.items()}
+        counts = {name: int((each < round(at_s * 1e9)).sum()) for name, each in sent_ns.items()}
         compared, difference = first_difference(past, run, counts, RecordedPackets())
         return Fork(run, compared, difference)
     with project.held(chosen, about) as session:
@@ -172,9 +173,3 @@ def _time_problems(
         yield f"it ended at {record['sim_s'] or 0:g} s of simulated time: fork it before"
     if chosen.duration is not None and chosen.end.sim_s is None:
         yield "it ends after a wall time: give --duration with simulated seconds (30sim)"
-
-
-def _sent_before(run: Run, connection: str, at_s: float) -> int:
-    """How many packets were sent before a moment of virtual time."""
-    sent_ns = read_packets(run.folder, run.ends[connection]).sent_ns
-    return int((sent_ns < round(at_s * 1e9)).sum())

@@ -498,9 +498,9 @@ class Supervisor:
     def _extend_drain(self, report: Report, now_s: float) -> None:
         """In virtual time, nodes know how long they may drain; here, whether they get on."""
         last = self.outcome.reports.get(report.node)
-        if self.phase is Phase.DRAINING and report.virtual_s is not None:
-            if last is None or last.virtual_s is None or report.virtual_s > last.virtual_s:
-                self._deadline_s = max(self._deadline_s, now_s + _DRAIN_S)
+        last_s = None if last is None else last.virtual_s
+        if self.phase is Phase.DRAINING and (report.virtual_s or 0.0) > (last_s or 0.0):
+            self._deadline_s = max(self._deadline_s, now_s + _DRAIN_S)
 
     def _tick_draining(self, now_s: float) -> None:
         if self._probing.check(now_s, 0.0) is Verdict.DRAINED:
