@@ -317,7 +317,7 @@ def review(run: Path, data: bytes) -> None:
         if crc32(data) % 32 == 0:  # they take seconds
             figures_of(opened)
     with allowed(NeurosError):
-        panels_page(open_run(run))
+        panels_page(open_for_review(run))
     with allowed(NeurosError):
         compare(open_run(run), open_run(a_run()[1]), RecordedPackets())
 
