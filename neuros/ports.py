@@ -362,6 +362,9 @@ class VirtualClock(Protocol):
     def send(self, packets: Mapping[str, Packet], sent: Callable[[], None]) -> None:
         """Send packets, by output, as soon as a hook could; then call ``sent``."""
 
+    def will_step_to(self, sim_time_s: float) -> None:
+        """The hook that runs steps the simulator so far, which will be the end of the hook."""
+
 
 Advance: TypeAlias = "Callable[[], Mapping[str, Packet]]"
 """Steps a world that runs by itself, to packets that are due or less far; returns them."""

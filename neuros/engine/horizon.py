@@ -161,20 +161,26 @@ class Horizon:
                 return outbox.arrival_ns(self._received[channel])
         return None
 
-    def learn(self, states: Iterable[KnownState]) -> bool:
-        """Keep the states that are newer than what is known; returns whether there was one."""
-        has_news = False
+    def learn(self, states: Iterable[KnownState]) -> list[str]:
+        """Keep the states that are newer than what is known; returns whose they are."""
+        news = []
         for state in states:
             known = self._states.get(state.node)
             if state.node != self.node and (known is None or known.version < state.version):
-                has_news = True
+                news.append(state.node)
                 self._states[state.node] = state
                 if known is None:
                     self._reach_ns.clear()
                 for name, channel in self._outward.items():
                     if channel.target == state.node:
                         self._forget(name, state)
-        return has_news
+        return news
+
+    def is_between(self, node: str) -> bool:
+        """Whether a neighbour of this node has no connection with another one."""
+        state = self._states[node]
+        near = {node, *state.sources, *(outbox.channel.target for outbox in state.outboxes)}
+        return not self.neighbours <= near
 
     # ------------------------------------------------------------------ what follows
 

@@ -693,6 +693,8 @@ class VirtualEffects(NodeEffects):
         if self._durations is None:
             loop = cast(NodeLoop, self._loop)
             self._durations = Durations(self._file, loop, lambda: self._time.now_s)
+            if self._handle.virtual_time is not None:
+                self._handle.virtual_time.durations = self._durations
             self._note_execution = self._hold
         self._hook = hook
         self._durations.begin(hook)

@@ -38,11 +38,12 @@ class Durations:
         self._since_ns = 0
         self._draws: dict[Hook, Draws] = {}
         self._declared_ns: int | None = None
+        self._stepped_ns = 0
 
     def begin(self, hook: Hook) -> None:
         """A hook starts."""
         self._since_ns = self._sim_ns()
-        self._declared_ns = None
+        self._declared_ns, self._stepped_ns = None, 0
         if hook.spec.kind is HookKind.INITIALISE:
             return
         duration = self._node.durations.get(hook.name)
@@ -56,6 +57,12 @@ class Durations:
             self._declared_ns = duration.at_ns(share)
         self._loop.announce(self._declared_ns or 0)
 
+    def will_step_to(self, sim_time_s: float) -> None:
+        """The hook steps the simulator so far: nodes that wait for this one may go on."""
+        if self._declared_ns is None:
+            self._stepped_ns = max(self._stepped_ns, round(sim_time_s * 1e9) - self._since_ns)
+            self._loop.announce(self._stepped_ns)
+
     def end(self, hook: Hook) -> None:
         """The function of the hook has returned: the node is held for the duration.
 
@@ -66,7 +73,8 @@ class Durations:
             return
         duration_ns = self._declared_ns
         if duration_ns is None:
-            duration_ns = max(0, self._sim_ns() - self._since_ns)
+            # What was announced stands, also if the hook resets the simulator afterwards.
+            duration_ns = max(self._stepped_ns, self._sim_ns() - self._since_ns)
             if not duration_ns and hook.drives and hook.spec.kind is HookKind.FUNCTION:
                 raise hook.error(": ".join(self._node.timeless(hook.name)))
         self._loop.hold(duration_ns)
@@ -86,7 +94,10 @@ class VirtualTime:
 
     Args:
         engine: the node's, of now.
-        guard: of events of the node.
+        failures: reports errors of events.
+
+    Attributes:
+        durations: of the hooks, once one has run.
     """
 
     def __init__(self, loop: NodeLoop, engine: Callable[[], Engine], failures: Failures) -> None:
@@ -95,6 +106,7 @@ class VirtualTime:
         self._failures = failures
         self._waiting: list[Callable[[], None]] = []
         self._is_active = False
+        self.durations: Durations | None = None
 
     def clock_s(self) -> float:
         """Seconds since time 0 of the run."""
@@ -118,6 +130,11 @@ class VirtualTime:
     def call_at(self, time_s: float, event: Callable[[], None]) -> None:
         """Call ``event`` so many seconds after time 0, or now if that has passed."""
         self._loop.at(self._loop.zero_ns + round(time_s * 1e9), partial(self._guard, event))
+
+    def will_step_to(self, sim_time_s: float) -> None:
+        """The hook that runs steps the simulator so far, which will be the end of the hook."""
+        if self.durations is not None:
+            self.durations.will_step_to(sim_time_s)
 
     def send(self, packets: Mapping[str, Any], sent: Callable[[], None]) -> None:
         """Send packets, by output, as soon as a hook could; then call ``sent``."""

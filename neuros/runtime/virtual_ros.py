@@ -30,12 +30,7 @@ from neuros.runtime.local import Event
 from neuros.runtime.virtual import DRAIN_S, NodeTime, OneWay, VirtualLoop
 from neuros.transport.codecs import HEADER
 from neuros.transport.lean_node import LeanNode
-from neuros.transport.ros import (
-    ReceivingLink,
-    RosTransport,
-    SendingLink,
-    position_of,
-)
+from neuros.transport.ros import ReceivingLink, RosTransport, SendingLink, position_of
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.ros_process import RosProcess
 
@@ -158,9 +153,10 @@ class RosVirtualLoop(VirtualLoop):
 
     def learn(self, states: Sequence[KnownState]) -> None:
         """States of nodes have come."""
-        if not self.horizon.learn(states):
+        news = self.horizon.learn(states)
+        if not news:
             return
-        self._has_news = True
+        self._has_news = self._has_news or any(map(self.horizon.is_between, news))
         ending = self.horizon.ending()
         if (
             ending is not None

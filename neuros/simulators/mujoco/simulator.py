@@ -147,6 +147,8 @@ class MuJoCo:
                 f"{when(second):g} s while its packet of {when(first):g} s is unread: call "
                 f"read('{output}') after each firing, every {second - first} steps"
             )
+        if self._node.virtual_time is not None:
+            self._node.virtual_time.will_step_to(world.time.seconds(target))
         self._advance_to(target)
 
     def read(self, output: str) -> Packet | None:
