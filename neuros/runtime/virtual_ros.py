@@ -215,9 +215,17 @@ class RosVirtualLoop(VirtualLoop):
     def _make_node(self, name: str, place: int) -> NodeTime:
         return RosNodeTime(self, name, place)
 
+    @property
+    def _is_behind_time_0(self) -> bool:
+        """Whether time 0 has come elsewhere: what arrives from there is later."""
+        return not self.has_begun and self.horizon.have_others_begun
+
+    def _can_go_on(self) -> bool:
+        return not self._is_behind_time_0 and super()._can_go_on()
+
     def _may_handle(self, time_ns: int) -> bool:
-        if not self.has_begun and self.horizon.have_others_begun:
-            return False  # what comes from them is later than time 0
+        if self._is_behind_time_0:
+            return False
         other = self.horizon.waits_for(time_ns)
         self.why_waiting = ""
         if other:

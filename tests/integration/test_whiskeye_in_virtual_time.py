@@ -34,3 +34,25 @@ def test_a_lossy_run_can_be_repeated(project: str, tmp_path: Path) -> None:
     imu = a.connections["robot.imu -> snn.imu"]
     if project != "tick_60ms":
         assert 20 <= imu["consumed"] < imu["sent"]  # a packet each 20 ms, and a hook takes 45
+
+
+def test_nodes_in_processes_of_their_own_give_the_same_run(tmp_path: Path) -> None:
+    in_process = run(tmp_path / "in_process", "asynchronous")
+    apart = run(tmp_path / "apart", "asynchronous", backend="process")
+    found = compare(in_process, apart, RecordedPackets())
+    assert (found.difference, found.remarks, found.not_compared) == (None, (), ())
+
+
+def test_a_ring_that_nothing_starts_is_a_deadlock_between_processes(tmp_path: Path) -> None:
+    ports = {"inputs": {"x": "std_msgs/msg/Int32"}, "outputs": {"y": "std_msgs/msg/Int32"}}
+    a, b = (neuros.Node(name, answer, **ports) for name in "ab")
+    lossless = {"discard_limit": 0}
+    ring = neuros.Project(
+        [a, b],
+        [a["y"].to(b["x"], **lossless), b["y"].to(a["x"], **lossless)],
+        folder=tmp_path,
+        time="virtual",
+    )
+    ended = ring.run(backend="process", output=tmp_path / "run")
+    assert ended.exit_code == 1
+    assert "deadlock: nothing can ever run again: a waits for `x` from b" in ended.reason
