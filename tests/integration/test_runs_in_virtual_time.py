@@ -1,23 +1,31 @@
-"""WhiskEye in virtual time: a run that may lose packets is the same in every repetition."""
+"""Runs in virtual time: those that may lose packets are the same in every repetition."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from launching import EXAMPLES, launch
 
+import neuros
 from neuros.api.run_record import PastRun, open_run
 from neuros.api.verify import RecordedPackets, compare
+from neuros.hooks import neuros_function
 
 WHISKEYE = EXAMPLES / "4_neurorobotics/whiskeye"
 DURATIONS = 'nodes.snn.durations.integrate={"normal":[0.045,0.005]}'
 
 
-def run(folder: Path, project: str) -> PastRun:
+@neuros_function(inputs="x", outputs="y")
+def answer(node: Any, x: Any) -> Any:
+    return x
+
+
+def run(folder: Path, project: str, backend: str = "in-process") -> PastRun:
     finished = launch(
         WHISKEYE / f"{project}.json",
-        *("--backend", "in-process", "--time", "virtual", "-o", str(folder)),
+        *("--backend", backend, "--time", "virtual", "-o", str(folder)),
         *("--set", "nodes.robot.environment.DURATION=1", "--set", DURATIONS),
         cwd=folder.parent,
     )
@@ -44,15 +52,14 @@ def test_nodes_in_processes_of_their_own_give_the_same_run(tmp_path: Path) -> No
 
 
 def test_a_ring_that_nothing_starts_is_a_deadlock_between_processes(tmp_path: Path) -> None:
-    ports = {"inputs": {"x": "std_msgs/msg/Int32"}, "outputs": {"y": "std_msgs/msg/Int32"}}
-    a, b = (neuros.Node(name, answer, **ports) for name in "ab")
-    lossless = {"discard_limit": 0}
-    ring = neuros.Project(
-        [a, b],
-        [a["y"].to(b["x"], **lossless), b["y"].to(a["x"], **lossless)],
-        folder=tmp_path,
-        time="virtual",
-    )
-    ended = ring.run(backend="process", output=tmp_path / "run")
+    number = "std_msgs/msg/Int32"
+    a, b = (neuros.Node(n, answer, inputs={"x": number}, outputs={"y": number}) for n in "ab")
+    connections = [
+        neuros.Connection(source["y"], target["x"], discard_limit=0)
+        for source, target in ((a, b), (b, a))
+    ]
+    ring = neuros.Project([a, b], connections, folder=tmp_path, time="virtual")
+    with pytest.warns(UserWarning, match="nobody starts the loop"):
+        ended = ring.run(backend="process", output=tmp_path / "run")
     assert ended.exit_code == 1
     assert "deadlock: nothing can ever run again: a waits for `x` from b" in ended.reason
