@@ -123,6 +123,7 @@ class Horizon:
 
     Attributes:
         neighbours: the nodes at the other ends of its channels.
+        begun_ns: time 0 of the run, once that has come.
     """
 
     def __init__(self, node: str, inward: Mapping[str, str], outward: Sequence[Channel]) -> None:
@@ -139,6 +140,7 @@ class Horizon:
         self._states: dict[str, KnownState] = {}
         self._own = KnownState(node, 0, Moment(), self._sources, (), {})
         self._reach_ns: dict[str, int] = {}
+        self.begun_ns: int | None = None
 
     # ------------------------------------------------------------------ what happens
 
@@ -277,6 +279,10 @@ class Horizon:
         """The earliest times of messages to the node, and of an end, each with its sender."""
         states, own = self._states, self._received
         first = {name: state.moment.next_ns for name, state in states.items()}
+        if self.begun_ns is not None:
+            for name, state in states.items():
+                if state.moment.zero_ns < 0:  # time 0 will have hooks of it start
+                    first[name] = min(first[name], self.begun_ns)
         for neighbour in self.neighbours:
             if neighbour not in states:
                 yield 0, neighbour

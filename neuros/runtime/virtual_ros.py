@@ -192,7 +192,7 @@ class RosVirtualLoop(VirtualLoop):
             if zero_ns is not None:
                 event, self._at_zero = self._at_zero, None
                 self._nodes[0].wait_until(zero_ns)
-                self.now_ns = zero_ns
+                self.now_ns = self.horizon.begun_ns = zero_ns
                 event()
                 return True
         if self._drain is not None and self._end is not None:
