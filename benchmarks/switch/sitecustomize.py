@@ -66,7 +66,7 @@ def without_ledger() -> dict[Place, Any]:
             Subscription.consume, {"self.taken.append": "", "self.taken_ns.append": ""}
         ),
         (SendWindow, "spend"): rewritten(SendWindow.spend, {"self.sent_ns.append": ""}),
-        (SimulatedTime, "look"): rewritten(SimulatedTime.look, {"self._timeline.note": ""}),
+        (SimulatedTime, "update"): rewritten(SimulatedTime.update, {"self._timeline.add": ""}),
         (MemoryTransport, "_add_digest"): nothing,
         (digests, "digest_of_bytes"): lambda _: 0,
     }
