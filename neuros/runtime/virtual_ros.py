@@ -359,7 +359,8 @@ class RosVirtualTransport(RosTransport):
         return _ALL
 
     def _on_receiver_found(self, connection: Connection, note: str, inbox: Inbox) -> None:
-        self._prepare(connection, note)
+        # Memory that both share is used again for newer packets where none is acknowledged.
+        self._prepare(connection, note if connection.is_reliable else "")
         link = self._sending[connection]
         assert isinstance(link, VirtualSendingLink)
         link.open_in(self._virtual, self._time)
