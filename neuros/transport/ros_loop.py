@@ -19,6 +19,7 @@ comes at once, while the node waits for others: a round trip takes no longer for
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import time
 from collections import deque
@@ -156,7 +157,7 @@ class RosLoop:
             try:
                 if timer.is_ready():
                     timer.handle.call_timer()
-                    self._executor.create_task(timer.callback)
+                    self._executor.create_task(_call_back, timer)
             except InvalidHandle:  # the plugin has destroyed it
                 self._ros_timers.remove(timer)
 
@@ -348,3 +349,10 @@ class RosLoop:
                     on_due()
                 except BaseException as error:
                     self._on_failure(error)
+
+
+def _call_back(timer: Timer) -> None:
+    """Call back a timer, unless a callback before this one has cancelled or destroyed it."""
+    with contextlib.suppress(InvalidHandle):
+        if not timer.is_canceled():
+            timer.callback()

@@ -56,6 +56,8 @@ DENIED = """
 2 bag info CLOSED/run
 2 bag info CLOSED/run/bag
 4 bag repair CLOSED/run
+2 bag convert CLOSED/run --output NEW
+4 fork CLOSED/run --at 1sim
 4 replay CLOSED/run --node counter
 2 replay CLOSED/run --topic *
 2 export compose CLOSED/clock
@@ -192,7 +194,7 @@ def test_the_reader_learns_whose_folder_it_is(
     said: dict[tuple[str, ...], Said], closed: Path
 ) -> None:
     assert said["report", "CLOSED/run"].output == (
-        f"neuros: {closed}/run/run.json cannot be opened (Permission denied): you may not enter"
+        f"neuros: {closed}/run cannot be opened (Permission denied): you may not enter"
         f" {closed}, which belongs to {closed.owner()}\n"
     )
 
