@@ -15,10 +15,7 @@ from dataclasses import dataclass
 from decimal import Context
 from functools import reduce
 from hashlib import blake2b
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from neuros.project.model import Node
+from typing import Any, Protocol
 
 REAL, VIRTUAL = "real", "virtual"
 """The clocks of a run: that of the machine, or one that only declared times move on."""
@@ -43,6 +40,15 @@ _TAIL = (
     (6.6579051150e0, 3.0812263860e0, 4.2868294337e-1, 1.7337203997e-2),
     (1.0, 2.4197894225e-1, 1.2258202635e-2),
 )
+
+
+class WithEnvironment(Protocol):
+    """A node, as far as seeds are concerned."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def environment(self) -> Mapping[str, str]: ...
 
 
 @dataclass(frozen=True)
@@ -134,7 +140,7 @@ def standard_normal(share: float) -> float:
     return -value if q < 0 else value
 
 
-def seeds(nodes: Iterable[Node]) -> dict[str, dict[str, str]]:
+def seeds(nodes: Iterable[WithEnvironment]) -> dict[str, dict[str, str]]:
     """By node, the variables of its environment with SEED in their names."""
     found = {
         node.name: {key: value for key, value in node.environment.items() if "SEED" in key.upper()}
@@ -143,7 +149,7 @@ def seeds(nodes: Iterable[Node]) -> dict[str, dict[str, str]]:
     return {name: variables for name, variables in found.items() if variables}
 
 
-def seed_of(nodes: Iterable[Node]) -> str:
+def seed_of(nodes: Iterable[WithEnvironment]) -> str:
     """The seed of all draws of a run: the variables with SEED in their names, of all nodes."""
     return json.dumps(seeds(nodes), sort_keys=True)
 

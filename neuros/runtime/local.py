@@ -22,14 +22,12 @@ from dataclasses import replace
 from types import MappingProxyType, SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from neuros.ports import Inbox, Logger, NodeEvents, StatePublisher, Transport, TransportKind
+from neuros.ports import Inbox, Logger, NodeEvents, StatePublisher, Transport
 from neuros.project.model import Connection, NodeFile, Port, Value
 from neuros.project.names import SESSION
-from neuros.project.timing import VIRTUAL
 from neuros.transport.imports_when_used import imports_when_used
 from neuros.transport.memory import GraphBridge, MemoryHub, MemoryTransport
 from neuros.transport.messages import RosPackets
-from neuros.transport.rclpy_patches import do_without_code_generator
 
 if TYPE_CHECKING:
     from neuros.transport.lean_node import Fail, LeanNode
@@ -562,44 +560,3 @@ class LocalMiddleware:
             if self._local is not None:
                 self._local.serve(self._ros.ros_loop)
         return self._ros
-
-
-class _OneProcess(TransportKind):
-    """``memory``, with topics on the ROS graph, and ``local``, with ROS where nodes ask for it."""
-
-    def __init__(self, name: str, *, has_ros: bool) -> None:
-        self.name = name
-        self._has_ros = has_ros
-
-    def middleware(
-        self,
-        files: Sequence[NodeFile],
-        on_failure: Callable[[BaseException], None],
-        *,
-        digests: bool,
-        record: bool,
-        debug: bool,
-    ) -> LocalMiddleware:
-        from neuros.transport.digests import TriedDigest, digest_of
-
-        do_without_code_generator()
-        is_lossless = all(c.discard_limit == 0 for file in files for c in file.connections)
-        tried = TriedDigest() if is_lossless and not record else None
-        keywords: dict[str, Any] = {
-            "files": files,
-            "exposes": self._has_ros,
-            "debug": debug,
-            "digest": digest_of if digests or record else tried,
-            # Of what is recorded, digests only tell which packets have arrived.
-            "digests_of": lambda c: digests or not (record and c.is_reliable),
-        }
-        if files[0].time == VIRTUAL:
-            from neuros.runtime.virtual import VirtualLoop, VirtualMiddleware
-
-            loop = VirtualLoop(files[0].seed)
-            return VirtualMiddleware(loop, None, on_failure, **keywords | {"digest": digest_of})
-        return LocalMiddleware(None if self._has_ros else LocalLoop(), None, on_failure, **keywords)
-
-
-MEMORY = _OneProcess("memory", has_ros=True)
-LOCAL = _OneProcess("local", has_ros=False)

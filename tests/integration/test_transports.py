@@ -13,7 +13,7 @@ from transport_checks import TOPIC, TransportChecks
 from neuros.backends.domain import choose_domain
 from neuros.ports import Transport, TransportKind
 from neuros.project.model import NodeFile
-from neuros.runtime.local import LOCAL, MEMORY
+from neuros.runtime.one_process import LOCAL, MEMORY
 from neuros.transport.executors import EXECUTOR_VARIABLE
 from neuros.transport.ros_process import ROS
 

@@ -13,7 +13,8 @@ import pytest
 
 from neuros.backends.domain import choose_domain
 from neuros.project.model import Folders, Node, NodeFile
-from neuros.runtime.local import LOCAL, LocalLoop, LocalMiddleware
+from neuros.runtime.local import LocalLoop, LocalMiddleware
+from neuros.runtime.one_process import LOCAL
 
 TIMEOUT_S = 20.0
 Event = Callable[[], None]
