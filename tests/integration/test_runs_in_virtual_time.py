@@ -58,8 +58,8 @@ def test_a_ring_that_nothing_starts_is_a_deadlock_between_processes(tmp_path: Pa
         neuros.Connection(source["y"], target["x"], discard_limit=0)
         for source, target in ((a, b), (b, a))
     ]
-    ring = neuros.Project([a, b], connections, folder=tmp_path, time="virtual")
     with pytest.warns(UserWarning, match="nobody starts the loop"):
-        ended = ring.run(backend="process", output=tmp_path / "run")
+        ring = neuros.Project([a, b], connections, folder=tmp_path, time="virtual")
+    ended = ring.run(backend="process", output=tmp_path / "run")
     assert ended.exit_code == 1
     assert "deadlock: nothing can ever run again: a waits for `x` from b" in ended.reason
