@@ -213,7 +213,7 @@ def test_a_run_whose_output_has_no_room_goes_on_and_its_command_says_so(tmp_path
     command = [sys.executable, "-m", "neuros.cli", "launch", str(clock), "-o", str(run)]
     with open("/dev/full", "w") as full:
         done = subprocess.run(
-            [*command, "--backend", "in-process", "--duration", "1"],
+            [*command, "--backend", "in-process", "--duration", "1.5"],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
