@@ -22,7 +22,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReli
 from std_msgs.msg import UInt8MultiArray
 
 from neuros.engine.horizon import NEVER_NS, Channel, Ending, Horizon, KnownState, Moment
-from neuros.ports import Inbox, Transport, TransportKind
+from neuros.ports import Inbox, Transport
 from neuros.project.model import Connection, NodeFile
 from neuros.project.names import INTERNAL
 from neuros.project.timing import LEAST_DELAY_NS
@@ -32,7 +32,7 @@ from neuros.transport.codecs import HEADER
 from neuros.transport.lean_node import LeanNode
 from neuros.transport.ros import ReceivingLink, RosTransport, SendingLink, position_of
 from neuros.transport.ros_loop import RosLoop
-from neuros.transport.ros_process import RosProcess
+from neuros.transport.ros_process import RosProcess, RosTransportKind
 
 _TURN_NS = 1_000_000
 """How long events of the node may keep those of ROS waiting, besides the hook that runs."""
@@ -392,21 +392,11 @@ class RosVirtualProcess(RosProcess):
         return self.virtual.of(file.node.name)
 
 
-class _VirtualRos(TransportKind):
+class _VirtualRos(RosTransportKind):
     """``virtual-ros``: nodes in processes of their own, or in containers, in virtual time."""
 
     name = "virtual-ros"
-
-    def middleware(
-        self,
-        files: Sequence[NodeFile],
-        on_failure: Callable[[BaseException], None],
-        *,
-        digests: bool,
-        record: bool,
-        debug: bool,
-    ) -> RosVirtualProcess:
-        return RosVirtualProcess(files, on_failure, debug=debug)
+    process = RosVirtualProcess
 
 
 VIRTUAL_ROS = _VirtualRos()

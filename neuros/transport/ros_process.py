@@ -272,10 +272,11 @@ def _qos(lease_s: float) -> QoSProfile:
     )
 
 
-class _Rclpy(TransportKind):
+class RosTransportKind(TransportKind):
     """``ros``: nodes in processes of their own, or in containers."""
 
     name = "ros"
+    process: type[RosProcess] = RosProcess
 
     def middleware(
         self,
@@ -286,7 +287,7 @@ class _Rclpy(TransportKind):
         record: bool,
         debug: bool,
     ) -> RosProcess:
-        return RosProcess(files, on_failure, debug=debug)
+        return self.process(files, on_failure, debug=debug)
 
 
-ROS = _Rclpy()
+ROS = RosTransportKind()
