@@ -50,9 +50,6 @@ COMMANDS = {
     "logs": Subcommand("neuros.cli.live", "show what the nodes of a run have logged"),
     "verify": Subcommand("neuros.cli.runs", "compare the packets of two runs"),
     "bag": Subcommand("neuros.cli.runs", "show or complete what a run has recorded"),
-    "replay": Subcommand(
-        "neuros.cli.replay", "run one node of a recorded run again, or publish recorded topics"
-    ),
     "doctor": Subcommand("neuros.cli.machine", "check this machine, and prove that packets arrive"),
     "containers": Subcommand(
         "neuros.cli.machine", "build, list and remove the images that nodes run in"
@@ -61,13 +58,9 @@ COMMANDS = {
         "neuros.cli.machine", "measure what NeuROS costs, compared with the same program without it"
     ),
     "reproduce": Subcommand("neuros.cli.machine", "repeat the published experiments"),
-    "fork": Subcommand(
-        "neuros.cli.fork", "run a past run again up to a moment, then go on with a change"
-    ),
     "node": Subcommand("neuros.cli.node"),
     "import-plugin": Subcommand("neuros.cli.projects"),
     "recorder": Subcommand("neuros.cli.recorder"),
-    "replayed": Subcommand("neuros.cli.replay"),
 }
 """Of NeuROS itself; ``neuros.registry.SUBCOMMANDS`` has those of extensions."""
 
