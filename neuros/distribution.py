@@ -69,10 +69,11 @@ def extensions() -> Iterator[tuple[Distribution, list[EntryPoint]]]:
 
 def versions() -> str:
     """A line for NeuROS and for each extension, with its version; they are all the same."""
-    found = sorted({(each.name, each.version) for each, _ in extensions()})
-    remedy = f"  (that of neuros is needed: {install_command()})"
-    lines = [f"{name} {version}{'' if version == __version__ else remedy}" for name, version in found]
-    return "\n".join([f"neuros {__version__}", *lines])
+    lines = [f"neuros {__version__}"]
+    for name, version in sorted({(each.name, each.version) for each, _ in extensions()}):
+        remedy = f"  (that of neuros is needed: {install_command()})"
+        lines.append(f"{name} {version}{remedy if version != __version__ else ''}")
+    return "\n".join(lines)
 
 
 def libraries() -> dict[str, Path]:

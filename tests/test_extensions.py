@@ -77,9 +77,8 @@ def test_its_facts_are_those_of_the_core_and_its_page_tells_how_it_is_installed(
         assert f"\n{line}\n" in text
     name = folder.name.removeprefix("neuros-")
     page = (folder / "README.md").read_text("utf-8").partition("\n## ")[0]
-    assert "extension `{}`: `./install.py` installs it, `pip install 'neuros[{}]'` does".format(
-        folder.name, name
-    ) in " ".join(page.split())
+    wanted = f"`./install.py` installs it, `pip install 'neuros[{name}]'` does so elsewhere."
+    assert f"extension `{folder.name}`: {wanted}" in " ".join(page.split())
 
 
 def test_the_version_is_shown_with_those_of_the_extensions(

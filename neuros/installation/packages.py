@@ -11,6 +11,7 @@ import ssl
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from neuros.distribution import python_command
@@ -205,13 +206,7 @@ class Installer:
             InstallationFailed: if uv fails, or is not there and cannot be installed.
             OSError: if it cannot be started, or the log cannot be written.
         """
-        # uv reads none of pip's files and variables, so pip lists its settings for uv.
-        pip = python_command("pip", "config", "list", python=self.python)
-        listing = answer_of(pip, self.environ)
-        environ, unknown = uv_environment(listing.stdout if listing else "", self.environ)
-        if unknown:
-            names = ", ".join(unknown)
-            self.progress.step(f"uv has no setting like pip's {names}, and goes without")
+        environ = dict(self._settings)
         if "--require-hashes" in arguments:
             # Lock files name every version, and uv refuses a constraint without a hash.
             environ.pop("UV_CONSTRAINT", None)
@@ -220,6 +215,17 @@ class Installer:
         if environ.get("UV_NO_INDEX", "0").lower() not in ("0", "no", "off", "false"):
             command.append("--no-index")
         return self._run([*command, *arguments], environ)
+
+    @cached_property
+    def _settings(self) -> Mapping[str, str]:
+        """The environment of uv, which reads none of pip's files and variables: pip lists them."""
+        pip = python_command("pip", "config", "list", python=self.python)
+        listing = answer_of(pip, self.environ)
+        environ, unknown = uv_environment(listing.stdout if listing else "", self.environ)
+        if unknown:
+            names = ", ".join(unknown)
+            self.progress.step(f"uv has no setting like pip's {names}, and goes without")
+        return environ
 
     def _run(self, command: Sequence[str], environ: Mapping[str, str]) -> str:
         """Run pip or uv, show what it does, and return what it wrote."""

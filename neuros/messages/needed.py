@@ -308,7 +308,7 @@ class _Builder:
         # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.
         # Generators open some files in the encoding of the locale, which may not be UTF-8.
         command = [sys.executable, "-I", "-X", "utf8", generation.__file__]
-        self._run(command, order.text())
+        self._run(command, json.dumps(order))
 
     def _compile(self) -> None:
         """Make the libraries of the package, and its module for Python."""
