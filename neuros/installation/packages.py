@@ -105,19 +105,23 @@ def install(
     installer.log.write_text("", "utf-8")
     extensions = [root / "extensions" / f"neuros-{extra}" for extra in extras]
     sources = [str(root), *(str(folder) for folder in extensions if folder.is_dir())]
-    editable = [word for source in sources for word in ("--editable", source)]
+    # uv leaves what a file names alone where it is installed and its cache-keys have not changed;
+    # arguments it builds each time.
+    listed = folder / "neuros-sources.txt"
+    listed.write_text("".join(f"-e {Path(source).as_uri()}\n" for source in sources), "utf-8")
     names = f"[{','.join(extras)}]"
     is_without_index = bool(environ.get("PIP_NO_INDEX"))
     source = environ.get("PIP_FIND_LINKS", "a folder") if is_without_index else "PyPI"
     progress.step(f"installing neuros{names} from {source} (log: {installer.log})")
     is_locked = not newest and not is_without_index
-    calls = [["--editable", f"{root}{names}", *editable[2:], *(["--upgrade"] if newest else [])]]
+    whole = ["--editable", f"{root}{names}", "--requirement", str(listed)]
+    calls = [[*whole, *(["--upgrade"] if newest else [])]]
     if is_locked:
         # No build isolation: it would take a setuptools that no lock file names.
         calls = [
             _locked(root, "build"),
             ["--no-build-isolation", *_locked(root, "core", *extras)],
-            ["--no-build-isolation", "--no-deps", *editable],
+            ["--no-build-isolation", "--no-deps", "--requirement", str(listed)],
         ]
     try:
         installer.require_uv(_locked(root, "uv") if is_locked else [UV])

@@ -16,12 +16,13 @@ from graphlib import CycleError
 from importlib.util import find_spec
 from pathlib import Path
 
+from neuros.caching import sweep
 from neuros.errors import EnvironmentFault, Problem
 from neuros.installation.machine import system_install
 from neuros.installation.progress import Progress
 from neuros.messages import generation
 from neuros.messages.package import MANIFEST, Package
-from neuros.messages.workspace import Built, Workspaces, cycle_problem, sweep
+from neuros.messages.workspace import Built, Workspaces, cycle_problem
 from neuros.project.model import Node
 
 # Packages that the generated code of services and actions needs, beside those in their files.
