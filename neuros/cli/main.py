@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from neuros.cli import EXIT_CODES
 from neuros.cli.terminal import harmless_output
-from neuros.distribution import __version__
+from neuros.distribution import versions
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 from neuros.options import positive_number, positive_seconds
 from neuros.ordinary_files import cannot_be_opened
@@ -231,7 +231,8 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
         epilog=EXIT_CODES,
         formatter_class=_Formatter,
     )
-    result.add_argument("--version", action="version", version=f"neuros {__version__}")
+    text = "show the versions of neuros and its extensions, and exit"
+    result.add_argument("--version", action=_Versions, nargs=0, help=text)
     commands = result.add_subparsers(title="commands", metavar=_COMMAND, required=True)
     shown = COMMANDS
     if command not in COMMANDS:  # what extensions bring takes some 10 ms to find
@@ -251,6 +252,14 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
             else:
                 added.prepare = prepare
     return result
+
+
+class _Versions(argparse.Action):
+    """Looks for extensions, which takes some 10 ms, only where it is asked to."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(versions())
+        parser.exit()
 
 
 @cache
