@@ -7,6 +7,7 @@ of a sensor. MuJoCo's cameras show colours only; a lidar is one rangefinder per 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,12 +15,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from neuros_robots.elements import Element
+from neuros_robots.elements import HUGE, Element
 from neuros_robots.frames import Joint, Link, Pose, Scope, from_quaternion, from_rpy
 from neuros_robots.mjcf import Building, Triangles
 
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _GEOMS = mujoco.mjtGeom
+_WHOLE = re.compile(r"0x[0-9a-f]{1,8}|0|[1-9]\d{0,9}", re.ASCII | re.IGNORECASE)
 _ALL_MASKS = 0xFFFF  # Gazebo's mask of a collision without one
 _GREY = (0.7, 0.7, 0.7, 1.0)
 # The diffuse colours of those materials of Gazebo that are plain colours.
@@ -188,9 +190,9 @@ def _read(building: Building, owner: Element, *, is_solid: bool) -> _Shape | Non
 
 def _is_solid(element: Element, sizes: Sequence[float]) -> bool:
     """Whether every size is positive. A shape of no size is left out: nothing can touch it."""
-    if not all(0 <= size < math.inf for size in sizes):
-        element.problem("every size must be positive")
-    elif not all(sizes):
+    if not all(0 <= size < HUGE for size in sizes):
+        element.problem(f"every size must be positive, and below {HUGE:g}")
+    elif min(sizes, default=1.0) < mujoco.mjMINVAL:
         element.omit("left out: it has no size")
         return False
     return True
@@ -218,7 +220,7 @@ def _read_surface(building: Building, collision: Element, geom: Any) -> None:
         return
     friction = surface.child("friction", "ode")
     if friction is not None:
-        along = friction.number("mu", 1.0)
+        along = friction.number("mu", 1.0, least=0.0)
         across = friction.number("mu2", along)
         geom.friction[0] = min(along, 1e6)
         if along > 1:
@@ -233,9 +235,9 @@ def _read_surface(building: Building, collision: Element, geom: Any) -> None:
         contact.remark("MuJoCo cannot detect a contact without a force: the element collides")
     mask = contact.child("collide_bitmask")
     if mask is not None:
-        try:
+        if _WHOLE.fullmatch(mask.text):
             building.masks[id(collision)] = int(mask.text, 0) & 0x7FFFFFFF
-        except ValueError:
+        else:
             mask.problem(f"'{mask.text}' is not a whole number")
 
 
@@ -368,7 +370,7 @@ def _add_rays(building: Building, link: Link, element: Element, pose: Pose) -> N
         element.omit(f"{count} rays: MuJoCo has a sensor for each, and {_MOST_RAYS} at most")
         return
     distance = settings.child("range")
-    most = math.inf if distance is None else distance.number("max", math.inf)
+    most = math.inf if distance is None else distance.number("max", math.inf, least=0.0)
     if distance is not None:
         distance.mark_all_read()
     for row, pitch in enumerate(pitches):

@@ -49,6 +49,7 @@ class Building:
         colliding_meshes: the <mesh> of collisions, by the names of their geoms.
         masks: the collision masks of collisions, by the id of their elements.
         joints: the names of MuJoCo's joints for a joint, by its name.
+        places: the elements of named things, by their names, for errors of MuJoCo's.
     """
 
     spec: Any
@@ -58,6 +59,7 @@ class Building:
     masks: dict[int, int] = field(default_factory=dict)
     colliding_meshes: dict[str, Element] = field(default_factory=dict)
     joints: dict[str, list[str]] = field(default_factory=dict)
+    places: dict[str, Element] = field(default_factory=dict)
     _names: dict[tuple[str, str], int] = field(default_factory=lambda: {("body", "world"): 1})
 
     def body(self, link: Link | None) -> Any:
@@ -92,8 +94,10 @@ class Building:
             number += 1
         self._names[sort, wanted] = number
         self._names.setdefault((sort, name), 1)
-        if number > 1 and element is not None:
-            element.remark(f"called '{name}': the name is taken")
+        if element is not None:
+            self.places[name] = element
+            if number > 1:
+                element.remark(f"called '{name}': the name is taken")
         return name
 
 
@@ -132,7 +136,9 @@ def finished(building: Building, roots: Sequence[Element]) -> Converted:
         except (ValueError, mujoco.FatalError) as error:
             if not building.meshes.drop_unusable():
                 if not report.problems:
-                    roots[0].problem(
+                    named = re.search(r"\bname '([^']*)'", message_of(error))
+                    place = building.places.get(named[1]) if named else None
+                    (place or roots[0]).problem(
                         f"MuJoCo cannot compile the converted model: {message_of(error)}"
                     )
                 report.raise_any()
