@@ -182,6 +182,8 @@ def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
             written.append(file)
             mesh.uservert, mesh.userface, mesh.file = [], [], str(file)
         mesh.file = os.path.relpath(mesh.file, folder)
+    for field_ in spec.hfields:
+        field_.file = os.path.relpath(field_.file, folder)
     lines = [f"{MARK} from {source.name}"]
     if converted.differences:
         lines += ["", "Not taken over, or not as it was:"]
@@ -251,6 +253,36 @@ class Meshes:
         if self._names[key] is None:
             uri.problem(_why_unread(file))
         return self._names[key]
+
+    def add_heights(self, uri: Element, size: tuple[float, ...]) -> tuple[str, float] | None:
+        """The name of a height field and the share of its height where it is lowest.
+
+        MuJoCo stretches the brightness of a picture from its darkest to its brightest point.
+        ``None`` after a problem.
+
+        Args:
+            size: half lengths along x and y, and the height of white, in metres.
+        """
+        try:
+            file = self.finder.find_file(uri.text, uri.file.parent)
+        except NotFound as error:
+            uri.problem(str(error), error.hint)
+            return None
+        picture = mujoco.MjSpec()
+        picture.add_texture(name="t", type=mujoco.mjtTexture.mjTEXTURE_2D, file=str(file))
+        try:
+            pixels = picture.compile().tex_data
+        except ValueError as error:
+            uri.problem(f"no heights can be read from it ({message_of(error)})", "MuJoCo reads PNG")
+            return None
+        darkest, brightest = int(pixels.min()) / 255, int(pixels.max()) / 255
+        name, number = file.stem, 1
+        while self.spec.hfield(name) is not None:
+            number += 1
+            name = f"{file.stem}_{number}"
+        top_m = max((brightest - darkest) * size[2], mujoco.mjMINVAL)
+        self.spec.add_hfield(name=name, file=str(file), size=[*size[:2], top_m, _THICKNESS_M])
+        return name, darkest
 
     def drop_unusable(self) -> bool:
         """Drop unusable meshes that are only seen; those that collide are problems.
