@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from neuros_robots import links
-from neuros_robots.elements import Element
+from neuros_robots.elements import HUGE, Element
 from neuros_robots.frames import Branch, Joint, Pose, Scope, Vector, read_pose
 from neuros_robots.mjcf import Building
 
@@ -18,7 +18,6 @@ _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
 _BALL, _FREE = mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE
 _INERTIA = {"ixx": 1.0, "iyy": 1.0, "izz": 1.0, "ixy": 0.0, "ixz": 0.0, "iyz": 0.0}
 _TOLERANCE = 1e-9
-_NO_LIMIT = 1e15
 _UNLIMITED_ENDS = (-1e16, 1e16)
 _MOST_LINKS = 1000
 # By type of joint: MuJoCo's joints that make it up, each with the element of its axis.
@@ -74,8 +73,10 @@ def _add_body(building: Building, branch: Branch) -> None:
     is_solid = inertial is not None and inertial.has("auto") and not link.is_static
     if not link.is_static and not is_solid:
         _set_inertia(body, link.element, inertial)
-    elif link.is_static and inertial is not None:
-        inertial.mark_all_read()  # a static body needs no inertia
+    elif link.is_static:
+        body.explicitinertial = True  # no mass, rather than one that MuJoCo computes of its shapes
+        if inertial is not None:
+            inertial.mark_all_read()
     if not link.element.is_true("gravity", default=True):
         body.gravcomp = 1.0
     if branch.joint is not None:
@@ -95,7 +96,7 @@ def _set_inertia(body: Any, link: Element, inertial: Element | None) -> None:
     else:
         pose = read_pose(inertial)
         mass, centre = inertial.number("mass", 1.0), pose.position
-        if not 0 <= mass < math.inf:
+        if not 0 <= mass < HUGE:
             (inertial.child("mass") or inertial).problem(f"must be a positive number, not {mass:g}")
         element = inertial.child("inertia") or inertial.made("inertia")
         ixx, iyy, izz, ixy, ixz, iyz = (element.number(*entry) for entry in _INERTIA.items())
@@ -119,8 +120,8 @@ def _give(body: Any, mass: float, matrix: Vector) -> None:
 
 def _possible(matrix: Vector, mass: float, element: Element) -> Vector:
     """The matrix, or a replacement if no rigid body has this inertia."""
-    if not np.isfinite(matrix).all():
-        element.problem("every moment of inertia must be finite")
+    if not (np.abs(matrix) < HUGE).all():
+        element.problem(f"every moment of inertia must be finite, and below {HUGE:g}")
         return np.eye(3)
     if np.abs(matrix).max() < mujoco.mjMINVAL:  # rounded
         matrix = np.zeros((3, 3))
@@ -276,9 +277,12 @@ def _read_dynamics(axis: Element, joint: Any, joint_type: str) -> None:
         lower = limit.number("lower", _UNLIMITED_ENDS[0])
         upper = limit.number("upper", _UNLIMITED_ENDS[1])
         if lower > upper:
-            limit.problem(f"the lower limit {lower:g} is above the upper one, {upper:g}")
-        elif joint_type != "continuous" and (lower > -_NO_LIMIT or upper < _NO_LIMIT):
-            lower, upper = max(lower, -_NO_LIMIT), min(upper, _NO_LIMIT)
+            limit.problem(
+                f"the lower limit {lower:g} is above the upper one, {upper:g}",
+                "a joint without limits is of type continuous",
+            )
+        elif joint_type != "continuous" and (lower > -HUGE or upper < HUGE):
+            lower, upper = max(lower, -HUGE), min(upper, HUGE)
             if lower == upper:
                 default = f" ({limit.text})" if limit.text else ""
                 limit.remark(f"'{joint.name}' is locked: both its limits are {lower:g}{default}")
@@ -287,15 +291,15 @@ def _read_dynamics(axis: Element, joint: Any, joint_type: str) -> None:
         effort = limit.number("effort", math.inf)
         if effort == 0:
             limit.remark("an effort of 0 would let nothing drive the joint: there is no such limit")
-        if 0 < effort < _NO_LIMIT:
+        if mujoco.mjMINVAL < effort < HUGE:
             joint.actfrcrange, joint.actfrclimited = [-effort, effort], True
         velocity = limit.child("velocity")
         if velocity is not None:  # an effective limit is listed as unsupported
-            velocity.is_read = not 0 <= limit.number("velocity", -1) < _NO_LIMIT
+            velocity.is_read = not 0 <= limit.number("velocity", -1) < HUGE
     dynamics = axis.child("dynamics")
     if dynamics is not None:
-        joint.damping[0] = dynamics.number("damping", 0.0)
-        joint.frictionloss = dynamics.number("friction", 0.0)
+        joint.damping[0] = dynamics.number("damping", 0.0, least=0.0)
+        joint.frictionloss = dynamics.number("friction", 0.0, least=0.0)
         joint.stiffness[0] = dynamics.number("spring_stiffness", 0.0)
         joint.springref = dynamics.number("spring_reference", 0.0)
 

@@ -40,6 +40,11 @@ _VISIBLE = re.compile(rb"[^\r\n]")
 _DECLARED = re.compile(rb"<\?xml[^>]*\bencoding\s*=", re.DOTALL)
 _MOST_BYTES = 64 << 20
 _MOST_ELEMENTS = 200_000
+_NUMBER = re.compile(
+    r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|[-+]?inf(inity)?", re.ASCII | re.IGNORECASE
+)
+HUGE = 1e15
+"""Above it, limits are none, and other numbers are a mistake."""
 _FILE_ELEMENTS = 20  # the cost of opening a file, in elements
 DEEPEST = 50
 """Most levels of models within models, and twice that of elements in a file."""
@@ -107,15 +112,22 @@ class Difference:
 
     Attributes:
         place: ``file:line`` of the first one.
-        path: its path in the document.
+        paths: of all elements of this kind with this reason, in the document.
         why: the reason, in words.
-        count: number of elements of this kind with this reason.
     """
 
     place: str
-    path: str
+    paths: Sequence[str]
     why: str
-    count: int = 1
+
+    @property
+    def path(self) -> str:
+        """The path of the first one."""
+        return self.paths[0]
+
+    @property
+    def count(self) -> int:
+        return len(self.paths)
 
     def __str__(self) -> str:
         more = f" (and {self.count - 1} more)" if self.count > 1 else ""
@@ -176,7 +188,7 @@ class Report:
         for element, why in notes:
             groups.setdefault((str(element.file), element.kind, why), []).append(element)
         return [
-            Difference(elements[0].place, elements[0].path, why, len(elements))
+            Difference(elements[0].place, [each.path for each in elements], why)
             for (_, _, why), elements in groups.items()
         ]
 
@@ -281,43 +293,52 @@ class Element:
 
     # ---- values; after a problem the default is returned
 
-    def numbers(self, default: Sequence[float]) -> tuple[float, ...]:
-        """The numbers in its text, as many as ``default`` has; they may be infinite."""
-        count, values = len(default), list[float]()
-        for word in self.text.split():
-            try:
-                values.append(float(word))
-            except ValueError:
-                self.problem(f"'{word}' is not a number")
+    def numbers(self, default: Sequence[float], key: str = "") -> tuple[float, ...]:
+        """The numbers in its text or attribute ``key``, as many as ``default`` has.
+
+        They may be infinite.
+        """
+        what = f"{key}: " if key else ""
+        words = (self.attributes[key] if key else self.text).split()
+        for word in words:
+            if not _NUMBER.fullmatch(word):
+                hint = "spaces stand between numbers" if "," in word else ""
+                self.problem(f"{what}'{word}' is not a number", hint)
                 return tuple(default)
-        if len(values) != count:
-            what = "a number" if count == 1 else f"{count} numbers"
-            self.problem(f"{what} must stand here, not {len(values)}")
+        if len(words) != len(default):
+            wanted = "a number" if len(default) == 1 else f"{len(default)} numbers"
+            self.problem(f"{what}{wanted} must stand here, not {len(words)}")
             return tuple(default)
-        if any(map(math.isnan, values)):
-            self.problem("every value must be a number, not nan")
-            return tuple(default)
-        return tuple(values)
+        return tuple(map(float, words))
+
+    def finite(self, default: Sequence[float], key: str = "") -> tuple[float, ...]:
+        """The same, of numbers that a simulator can compute with."""
+        values = self.numbers(default, key)
+        wrong = next((value for value in values if not abs(value) < HUGE), None)
+        if wrong is None:
+            return values
+        what = f"{key}: " if key else ""
+        self.problem(f"{what}a number must be finite, and below {HUGE:g}, not {wrong:g}")
+        return tuple(default)
 
     def vector(self, tag: str, default: tuple[float, ...]) -> tuple[float, ...]:
         """The finite numbers in the child ``tag``, as many as ``default`` has."""
         element = self.child(tag)
-        if element is None or not element.text:
-            return default
-        values = element.numbers(default)
-        if all(map(math.isfinite, values)):
-            return values
-        element.problem("every number must be finite")
-        return default
+        return default if element is None or not element.text else element.finite(default)
 
-    def number(self, tag: str, default: float, *, positive: bool = False) -> float:
+    def number(
+        self, tag: str, default: float, *, positive: bool = False, least: float = -math.inf
+    ) -> float:
         """The number in the child ``tag``; it may be infinite, unless it must be ``positive``."""
         element = self.child(tag)
         if element is None or not element.text:
             return default
         (value,) = element.numbers((default,))
-        if positive and not 0 < value < math.inf:
+        if positive and not 0 < value < HUGE:
             element.problem(f"must be a positive number, not {value:g}")
+            return default
+        if value < least:
+            element.problem(f"must be at least {least:g}, not {value:g}")
             return default
         return value
 

@@ -78,12 +78,12 @@ def read_pose(owner: Element) -> Pose:
     if element is None or not element.text:
         return Pose()
     if element.attributes.get("rotation_format") == "quat_xyzw":
-        x, y, z, qx, qy, qz, qw = element.numbers((0, 0, 0, 0, 0, 0, 1))
+        x, y, z, qx, qy, qz, qw = element.finite((0, 0, 0, 0, 0, 0, 1))
         if not math.hypot(qx, qy, qz, qw):
             element.problem("the quaternion is zero")
             return Pose()
         return from_quaternion((x, y, z), (qw, qx, qy, qz))
-    x, y, z, *angles = element.numbers((0,) * 6)
+    x, y, z, *angles = element.finite((0,) * 6)
     if element.has("degrees"):
         angles = [math.radians(angle) for angle in angles]
     return from_rpy(x, y, z, *angles)

@@ -7,6 +7,7 @@ of a sensor. MuJoCo's cameras show colours only; a lidar is one rangefinder per 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,12 +15,13 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from neuros_robots.elements import Element
-from neuros_robots.frames import Joint, Link, Pose, Scope, from_quaternion, from_rpy
+from neuros_robots.elements import HUGE, Element
+from neuros_robots.frames import Joint, Link, Pose, Scope, Vector, from_quaternion, from_rpy
 from neuros_robots.mjcf import Building, Triangles
 
 _VISUAL_GROUP, _COLLISION_GROUP = 2, 3  # MuJoCo shows groups 0 to 2 unless told otherwise
 _GEOMS = mujoco.mjtGeom
+_WHOLE = re.compile(r"0x[0-9a-f]{1,8}|0|[1-9]\d{0,9}", re.ASCII | re.IGNORECASE)
 _ALL_MASKS = 0xFFFF  # Gazebo's mask of a collision without one
 _GREY = (0.7, 0.7, 0.7, 1.0)
 # The diffuse colours of those materials of Gazebo that are plain colours.
@@ -76,7 +78,10 @@ _LIGHTS = {
 
 @dataclass
 class _Shape:
-    """A geometry in MuJoCo's terms: half lengths in metres; ``pose`` is seen from its owner."""
+    """A geometry in MuJoCo's terms: half lengths in metres; ``pose`` is seen from its owner.
+
+    ``mesh`` is the name of a mesh, or of a height field.
+    """
 
     type: Any
     size: list[float] = field(default_factory=list)
@@ -120,19 +125,20 @@ def _add(building: Building, link: Link, element: Element, *, is_solid: bool) ->
     geometry = next(iter((element.child("geometry") or element).children), element)
     if shape is None or not _is_solid(geometry, shape.size):
         return None
-    if shape.type == _GEOMS.mjGEOM_PLANE and not link.is_static:
-        element.omit("MuJoCo has planes only where nothing moves")
+    if shape.type in (_GEOMS.mjGEOM_PLANE, _GEOMS.mjGEOM_HFIELD) and not link.is_static:
+        element.omit("MuJoCo has planes and height fields only where nothing moves")
         return None
     pose = link.scope.read_pose(element, link.pose) @ shape.pose
     name = f"{link.name}/{element.name}"
     noting = element if element.tag == "collision" else None  # node files do not name visuals
     geom = building.add("geom", link, pose, name, noting, type=shape.type)
     geom.size[: len(shape.size)] = shape.size
-    if shape.mesh:
+    if shape.type == _GEOMS.mjGEOM_HFIELD:
+        geom.hfieldname = shape.mesh
+    elif shape.mesh:
         geom.meshname = shape.mesh
-    mesh = element.child("geometry", "mesh")
-    if shape.mesh and mesh is not None and element.tag == "collision":
-        building.colliding_meshes[geom.name] = mesh
+        if geometry.tag != "cone" and element.tag == "collision":
+            building.colliding_meshes[geom.name] = geometry
     return geom
 
 
@@ -182,15 +188,24 @@ def _read(building: Building, owner: Element, *, is_solid: bool) -> _Shape | Non
             scale = element.vector("scale", (1.0, 1.0, 1.0))
             found = building.meshes.add_file(uri, scale, is_solid=is_solid)
             return None if found is None else _Shape(_GEOMS.mjGEOM_MESH, mesh=found)
+        case "polyline":
+            outlines = [each for each in geometry.children if each.tag == "polyline"]
+            extruded = _extruded(outlines)
+            if extruded is None:
+                return None
+            name = building.meshes.add(element, "polyline", extruded, is_solid=is_solid)
+            return _Shape(_GEOMS.mjGEOM_MESH, mesh=name)
+        case "heightmap":
+            return _heights(building, element)
     element.omit(f"MuJoCo has no geom for a <{element.tag}>")
     return None
 
 
 def _is_solid(element: Element, sizes: Sequence[float]) -> bool:
     """Whether every size is positive. A shape of no size is left out: nothing can touch it."""
-    if not all(0 <= size < math.inf for size in sizes):
-        element.problem("every size must be positive")
-    elif not all(sizes):
+    if not all(0 <= size < HUGE for size in sizes):
+        element.problem(f"every size must be positive, and below {HUGE:g}")
+    elif min(sizes, default=1.0) < mujoco.mjMINVAL:
         element.omit("left out: it has no size")
         return False
     return True
@@ -208,6 +223,75 @@ def _cone(radius: float, length: float) -> Triangles:
     return vertices, np.concatenate((sides, base)).astype(np.int32)
 
 
+def _extruded(outlines: Sequence[Element]) -> Triangles | None:
+    """A ``<polyline>`` from z = 0 to its height; ``None`` after a problem."""
+    element = outlines[0]
+    for hole in outlines[1:]:
+        hole.omit("a second outline is a hole in the first: it is filled")
+    before = len(element.report.problems)
+    points = [np.array(point.finite((0.0, 0.0))) for point in element.each("point")]
+    height = element.number("height", 1.0, positive=True)
+    if len(element.report.problems) > before:
+        return None
+    if len(points) > 1 and np.array_equal(points[0], points[-1]):
+        points.pop()  # the outline is closed anyway
+    count = len(points)
+    following = zip(points, points[1:] + points[:1], strict=True)
+    area = sum(float(a[0] * b[1] - a[1] * b[0]) for a, b in following)
+    order = list(range(count))[:: 1 if area > 0 else -1]
+    ring = [*order]
+    caps = []
+    while len(ring) > 2:
+        ear = next((at for at in range(len(ring)) if _is_ear(points, ring, at)), None)
+        if ear is None:
+            element.problem("its points do not surround an area, or its sides cross")
+            return None
+        caps.append((ring[ear - 1], ring[ear], ring[(ear + 1) % len(ring)]))
+        ring.pop(ear)
+    if not caps:
+        element.problem(f"an outline has 3 points at least, not {count}")
+        return None
+    faces = [(c, b, a) for a, b, c in caps] + [
+        (a + count, b + count, c + count) for a, b, c in caps
+    ]
+    for a, b in zip(order, order[1:] + order[:1], strict=True):
+        faces += [(a, b, b + count), (a, b + count, a + count)]
+    vertices = [(*point, z) for z in (0.0, height) for point in points]
+    return np.array(vertices), np.array(faces, np.int32)
+
+
+def _is_ear(points: Sequence[Vector], ring: Sequence[int], at: int) -> bool:
+    """Whether a corner of an anticlockwise ring can be cut off: it holds no other corner."""
+    ends = ring[at - 1], ring[at], ring[(at + 1) % len(ring)]
+
+    def side(a: Vector, b: Vector, c: Vector) -> float:
+        return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
+
+    a, b, c = (points[end] for end in ends)
+    return side(a, b, c) > 0 and not any(
+        min(side(a, b, p), side(b, c, p), side(c, a, p)) >= 0
+        for p in (points[index] for index in ring if index not in ends)
+    )
+
+
+def _heights(building: Building, element: Element) -> _Shape | None:
+    """A ``<heightmap>``: the brightness of a picture, whose top is at +y, as height."""
+    uri, place = element.child("uri"), Pose(np.array(element.vector("pos", (0.0, 0.0, 0.0))))
+    across, along, up = element.vector("size", (1.0, 1.0, 1.0))
+    for part in element.children:
+        if part.tag in ("texture", "blend", "use_terrain_paging", "sampling"):
+            part.omit("MuJoCo shows a height field in one colour")
+    if uri is None or not uri.text:
+        element.problem("<uri> is missing: which picture has the heights?")
+        return None
+    found = building.meshes.add_heights(uri, (across / 2, along / 2, up))
+    if found is None or not _is_solid(element, (across, along, up)):
+        return None
+    name, lowest = found
+    offset = Pose(np.array([0.0, 0.0, lowest * up]))
+    return _Shape(_GEOMS.mjGEOM_HFIELD, mesh=name, pose=place @ offset)
+
+
 def _halves(element: Element, default: tuple[float, ...]) -> list[float]:
     return [length / 2 for length in element.vector("size", default)]
 
@@ -218,7 +302,7 @@ def _read_surface(building: Building, collision: Element, geom: Any) -> None:
         return
     friction = surface.child("friction", "ode")
     if friction is not None:
-        along = friction.number("mu", 1.0)
+        along = friction.number("mu", 1.0, least=0.0)
         across = friction.number("mu2", along)
         geom.friction[0] = min(along, 1e6)
         if along > 1:
@@ -233,9 +317,9 @@ def _read_surface(building: Building, collision: Element, geom: Any) -> None:
         contact.remark("MuJoCo cannot detect a contact without a force: the element collides")
     mask = contact.child("collide_bitmask")
     if mask is not None:
-        try:
+        if _WHOLE.fullmatch(mask.text):
             building.masks[id(collision)] = int(mask.text, 0) & 0x7FFFFFFF
-        except ValueError:
+        else:
             mask.problem(f"'{mask.text}' is not a whole number")
 
 
@@ -368,7 +452,7 @@ def _add_rays(building: Building, link: Link, element: Element, pose: Pose) -> N
         element.omit(f"{count} rays: MuJoCo has a sensor for each, and {_MOST_RAYS} at most")
         return
     distance = settings.child("range")
-    most = math.inf if distance is None else distance.number("max", math.inf)
+    most = math.inf if distance is None else distance.number("max", math.inf, least=0.0)
     if distance is not None:
         distance.mark_all_read()
     for row, pitch in enumerate(pitches):

@@ -49,6 +49,7 @@ class Building:
         colliding_meshes: the <mesh> of collisions, by the names of their geoms.
         masks: the collision masks of collisions, by the id of their elements.
         joints: the names of MuJoCo's joints for a joint, by its name.
+        places: the elements of named things, by their names, for errors of MuJoCo's.
     """
 
     spec: Any
@@ -58,6 +59,7 @@ class Building:
     masks: dict[int, int] = field(default_factory=dict)
     colliding_meshes: dict[str, Element] = field(default_factory=dict)
     joints: dict[str, list[str]] = field(default_factory=dict)
+    places: dict[str, Element] = field(default_factory=dict)
     _names: dict[tuple[str, str], int] = field(default_factory=lambda: {("body", "world"): 1})
 
     def body(self, link: Link | None) -> Any:
@@ -92,8 +94,10 @@ class Building:
             number += 1
         self._names[sort, wanted] = number
         self._names.setdefault((sort, name), 1)
-        if number > 1 and element is not None:
-            element.remark(f"called '{name}': the name is taken")
+        if element is not None:
+            self.places[name] = element
+            if number > 1:
+                element.remark(f"called '{name}': the name is taken")
         return name
 
 
@@ -132,7 +136,9 @@ def finished(building: Building, roots: Sequence[Element]) -> Converted:
         except (ValueError, mujoco.FatalError) as error:
             if not building.meshes.drop_unusable():
                 if not report.problems:
-                    roots[0].problem(
+                    named = re.search(r"\bname '([^']*)'", message_of(error))
+                    place = building.places.get(named[1]) if named else None
+                    (place or roots[0]).problem(
                         f"MuJoCo cannot compile the converted model: {message_of(error)}"
                     )
                 report.raise_any()
@@ -176,6 +182,8 @@ def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
             written.append(file)
             mesh.uservert, mesh.userface, mesh.file = [], [], str(file)
         mesh.file = os.path.relpath(mesh.file, folder)
+    for field_ in spec.hfields:
+        field_.file = os.path.relpath(field_.file, folder)
     lines = [f"{MARK} from {source.name}"]
     if converted.differences:
         lines += ["", "Not taken over, or not as it was:"]
@@ -245,6 +253,36 @@ class Meshes:
         if self._names[key] is None:
             uri.problem(_why_unread(file))
         return self._names[key]
+
+    def add_heights(self, uri: Element, size: tuple[float, ...]) -> tuple[str, float] | None:
+        """The name of a height field and the share of its height where it is lowest.
+
+        MuJoCo stretches the brightness of a picture from its darkest to its brightest point.
+        ``None`` after a problem.
+
+        Args:
+            size: half lengths along x and y, and the height of white, in metres.
+        """
+        try:
+            file = self.finder.find_file(uri.text, uri.file.parent)
+        except NotFound as error:
+            uri.problem(str(error), error.hint)
+            return None
+        picture = mujoco.MjSpec()
+        picture.add_texture(name="t", type=mujoco.mjtTexture.mjTEXTURE_2D, file=str(file))
+        try:
+            pixels = picture.compile().tex_data
+        except ValueError as error:
+            uri.problem(f"no heights can be read from it ({message_of(error)})", "MuJoCo reads PNG")
+            return None
+        darkest, brightest = int(pixels.min()) / 255, int(pixels.max()) / 255
+        name, number = file.stem, 1
+        while self.spec.hfield(name) is not None:
+            number += 1
+            name = f"{file.stem}_{number}"
+        top_m = max((brightest - darkest) * size[2], mujoco.mjMINVAL)
+        self.spec.add_hfield(name=name, file=str(file), size=[*size[:2], top_m, _THICKNESS_M])
+        return name, darkest
 
     def drop_unusable(self) -> bool:
         """Drop unusable meshes that are only seen; those that collide are problems.

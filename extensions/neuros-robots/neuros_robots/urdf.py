@@ -371,7 +371,10 @@ class _Robot:
         keys: list[str] = [key for key in ("effort", "velocity") if key in values]
         keys += ("lower", "upper") if joint.type in _LIMITED else ()  # 0 where they are missing
         place = limit or joint
-        rows = [place.made(key, _text(_numbers(place, key, (0.0,)))) for key in keys]
+        rows = [
+            place.made(key, _text(place.numbers((0.0,), key) if key in values else (0.0,)))
+            for key in keys
+        ]
         is_given = bool({"lower", "upper"} & {*values})
         content.append(place.made("limit", "" if is_given else "URDF's default", *rows))
         if dynamics is not None:
@@ -431,26 +434,8 @@ def _surface(extensions: Sequence[Element]) -> list[Element]:
 
 
 def _numbers(element: Element, key: str, default: Sequence[float]) -> tuple[float, ...]:
-    """The finite numbers in an attribute, as many as ``default`` has.
-
-    The default takes their place if there is no such attribute, and after a problem.
-    """
-    if key not in element.attributes:
-        return tuple(default)
-    values = []
-    for word in element.attributes[key].split() or [""]:
-        try:
-            value = float(word)
-        except ValueError:
-            value = math.nan
-        if not math.isfinite(value):
-            element.problem(f"{key} must be finite, not '{word}'")
-            return tuple(default)
-        values.append(value)
-    if len(values) != len(default):
-        element.problem(f"{key} has {len(default)} numbers, not {len(values)}")
-        return tuple(default)
-    return tuple(values)
+    """The finite numbers in an attribute, as many as ``default`` has, which stands for none."""
+    return element.finite(default, key) if key in element.attributes else tuple(default)
 
 
 def _text(values: Sequence[float]) -> str:

@@ -11,32 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from hypothesis import strategies as st
 
-Matrix = npt.NDArray[np.float64]
-
-
-def turn(axis: Matrix, angle: float) -> Matrix:
-    """Rotation about a unit axis through the origin, after Rodrigues; shape (4, 4)."""
-    x, y, z = axis
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    result = np.eye(4)
-    result[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-    return result
-
-
-def shift(vector: Matrix) -> Matrix:
-    result = np.eye(4)
-    result[:3, 3] = vector
-    return result
-
-
-def matrix_of(pose: list[float]) -> Matrix:
-    """x, y, z, roll, pitch, yaw as a matrix: turned about the fixed axes x, then y, then z."""
-    x_axis, y_axis, z_axis = np.eye(3)
-    turned = turn(z_axis, pose[5]) @ turn(y_axis, pose[4]) @ turn(x_axis, pose[3])
-    return shift(np.array(pose[:3])) @ turned
+from tests.corpus.independent import Matrix, matrix_of, shift, turn
 
 
 @dataclass

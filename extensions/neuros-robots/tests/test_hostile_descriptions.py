@@ -6,6 +6,7 @@ import os
 import time
 from pathlib import Path
 
+import mujoco
 import pytest
 
 from neuros.cli.main import main
@@ -91,24 +92,56 @@ def test_an_unknown_encoding_is_named(tmp_path: Path, capsys: pytest.CaptureFixt
             assert "this is not XML: " in said(capsys, tmp_path, head + text, suffix)
 
 
-@pytest.mark.parametrize("number", ["nan", "inf", "-inf", "NAN", "1e999"])
-def test_numbers_of_urdf_are_finite(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], number: str
+@pytest.mark.parametrize(
+    ("number", "problem"),
+    [
+        ("inf", "a number must be finite, and below 1e+15, not inf"),
+        ("-1e999", "a number must be finite, and below 1e+15, not -inf"),
+        ("1e300", "a number must be finite, and below 1e+15, not 1e+300"),
+        ("", "a number must stand here, not 0"),
+        ("1 2", "a number must stand here, not 2"),
+        ("x", "'x' is not a number"),
+        ("nan", "'nan' is not a number"),
+        # Python would read these.
+        ("1_0", "'1_0' is not a number"),
+        ("\u0661", "'\u0661' is not a number"),
+        ("1,5", "'1,5' is not a number (spaces stand between numbers)"),
+    ],
+)
+def test_a_number_is_one_for_everybody(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], number: str, problem: str
 ) -> None:
     text = URDF.format("1", number, INERTIAL.format("1"), "")
+    place = "link[b]/inertial/mass: value"
     column = text.index("<mass", text.index('name="b"')) + 1
-    wanted = f"robot.urdf:1:{column}: link[b]/inertial/mass: value must be finite, not '{number}'"
-    assert wanted in said(capsys, tmp_path, text, "urdf")
-
-
-@pytest.mark.parametrize("number", ["", "x", "nan"])
-def test_a_follower_has_numbers(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], number: str
-) -> None:
+    assert f"robot.urdf:1:{column}: {place}: {problem}" in said(capsys, tmp_path, text, "urdf")
     mimic = f'<mimic joint="j" multiplier="{number}"/>'
     text = URDF.format("1", "1", INERTIAL.format("1"), mimic)
-    error = said(capsys, tmp_path, text, "urdf")
-    assert f"joint[k]/mimic: multiplier must be finite, not '{number}'" in error
+    assert f"joint[k]/mimic: multiplier: {problem}" in said(capsys, tmp_path, text, "urdf")
+    text = SDF.format(f'<link name="l"><inertial><pose>0 0 0 {number} 0 0</pose></inertial></link>')
+    of_six = problem.replace("a number must stand here, not 0", "6 numbers must stand here, not 5")
+    of_six = of_six.replace("a number must stand here, not 2", "6 numbers must stand here, not 7")
+    assert f"link[l]/inertial/pose: {of_six}" in said(capsys, tmp_path, text)
+
+
+def test_a_limit_may_be_none(tmp_path: Path) -> None:
+    for number in ("inf", "1e16", "1.79769e+308"):
+        limit = f'<limit lower="-{number}" upper="{number}" effort="{number}"/>'
+        text = URDF.format("1", "1", INERTIAL.format("1"), limit).replace("continuous", "revolute")
+        (tmp_path / "robot.urdf").write_text(text)
+        assert main(["convert", str(tmp_path / "robot.urdf"), "--force"]) == 0
+        model = mujoco.MjModel.from_xml_path(str(tmp_path / "robot.xml"))
+        assert not model.joint("k").limited[0]
+        assert not model.jnt_actfrclimited.any()
+
+
+def test_an_error_of_mujocos_has_the_place_of_what_it_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    light = '<inertial auto="true"/><collision name="c"><density>1e-30</density><geometry>{}'
+    light = light.format("<sphere/></geometry></collision>")
+    text = SDF.format(f'\n<link name="k"/>\n<link name="l">{light}</link>')
+    assert "robot.sdf:3:1: model[m]/link[l]: MuJoCo cannot" in said(capsys, tmp_path, text)
 
 
 def test_a_name_of_a_mesh_may_be_longer_than_any_file_has(

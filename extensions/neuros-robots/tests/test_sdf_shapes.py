@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+
 import mujoco
 import numpy as np
 import pytest
-from describing import BOX, CUBE, Folder, link
+from describing import BOX, CUBE, Folder, link, positions
+from neuros_robots.mjcf import write_mjcf
 
 GEOM = mujoco.mjtGeom
 
@@ -82,7 +86,7 @@ def test_a_plane_lies_along_its_normal_where_nothing_moves(folder: Folder) -> No
     mujoco.mju_quat2Mat(axes, model.geom("wall/side").quat)
     np.testing.assert_allclose(axes.reshape(3, 3)[:, 2], [1, 0, 0], atol=1e-12)
     (why,) = folder.notes(wall).values()
-    assert why == "MuJoCo has planes only where nothing moves"
+    assert why == "MuJoCo has planes and height fields only where nothing moves"
 
 
 def test_a_mesh_keeps_its_scale_and_stands_beside_the_file(folder: Folder) -> None:
@@ -132,3 +136,88 @@ def test_links_of_one_model_collide_only_if_it_says_so(folder: Folder) -> None:
     two = link("a", shape) + link("b", shape)
     assert folder.model(two).nexclude == 1
     assert folder.model(f"<self_collide>true</self_collide>{two}").nexclude == 0
+
+
+def outline(points: str, height: float = 2.0, more: str = "") -> str:
+    rows = "".join(f"<point>{point}</point>" for point in points.split(", "))
+    shape = f"<polyline>{rows}<height>{height}</height></polyline>{more}"
+    return f'<inertial auto="true"/><collision name="c"><geometry>{shape}</geometry></collision>'
+
+
+@pytest.mark.parametrize("turned", [1, -1])
+def test_an_outline_is_extruded_upwards(folder: Folder, turned: int) -> None:
+    # An L of 3 unit squares, whichever way round it is drawn.
+    points = ["0 0", "2 0", "2 1", "1 1", "1 2", "0 2"][::turned]
+    result = folder.convert(f'<model name="m">{link_of(outline(", ".join(points)))}</model>')
+    model = result.spec.compile()
+    assert model.body("l").mass == pytest.approx(3 * 2 * 1000)
+    centre = [5 / 6, 5 / 6, 1]
+    np.testing.assert_allclose(model.body("l").ipos, centre, atol=1e-6)
+    assert [note.why for note in result.differences] == [
+        "MuJoCo collides the convex hull of a mesh"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("points", "problem"),
+    [
+        ("0 0, 1 1", "an outline has 3 points at least, not 2"),
+        ("0 0, 1 1, 2 2", "its points do not surround an area, or its sides cross"),
+        ("0 0, 1 1, 1 0, 0 1", "its points do not surround an area, or its sides cross"),
+        ("0 0, 1 x, 1 0", "'x' is not a number"),
+    ],
+)
+def test_an_outline_that_surrounds_nothing_is_a_problem(
+    folder: Folder, points: str, problem: str
+) -> None:
+    (said,) = folder.problems(link_of(outline(points)))
+    assert problem in said
+
+
+def link_of(inside: str) -> str:
+    return f'<link name="l">{inside}</link>'
+
+
+def picture(rows: list[list[int]]) -> bytes:
+    """A grey picture in PNG."""
+
+    def part(kind: bytes, data: bytes) -> bytes:
+        whole = kind + data
+        return struct.pack(">I", len(data)) + whole + struct.pack(">I", zlib.crc32(whole))
+
+    head = struct.pack(">IIBBBBB", len(rows[0]), len(rows), 8, 0, 0, 0, 0)
+    data = zlib.compress(b"".join(b"\0" + bytes(row) for row in rows))
+    return b"\x89PNG\r\n\x1a\n" + part(b"IHDR", head) + part(b"IDAT", data) + part(b"IEND", b"")
+
+
+def terrain(inside: str) -> str:
+    shape = f"<heightmap><uri>hill.png</uri>{inside}</heightmap>"
+    collision = f'<collision name="c"><geometry>{shape}</geometry></collision>'
+    return f"<static>true</static>{link_of(collision)}"
+
+
+def test_a_height_map_is_a_height_field(folder: Folder) -> None:
+    # 51 to 255 of 255: from 1 m to 5 m; the brightest row is the first, which is at +y.
+    rows = [[255] * 5, [204] * 5, [153] * 5, [102] * 5, [51] * 5]
+    (folder.path / "hill.png").write_bytes(picture(rows))
+    inside = "<size>8 8 5</size><pos>0 0 10</pos>"
+    model = folder.model(terrain(inside))
+    data = positions(model)
+    for y, height in ((-3.9, 1.05), (0, 3), (3.9, 4.95)):
+        hit = mujoco.mj_ray(
+            model, data, np.array([0.1, y, 99.0]), np.array([0, 0, -1.0]), None, 1, -1,
+            np.zeros(1, np.int32),
+        )  # fmt: skip
+        assert 99 - hit == pytest.approx(10 + height, abs=1e-2)
+    output = folder.path / "out" / "model.xml"
+    write_mjcf(folder.convert(f'<model name="m">{terrain(inside)}</model>'), output, output)
+    assert mujoco.MjModel.from_xml_path(str(output)).nhfield == 1
+
+
+def test_a_height_map_that_cannot_be_read_is_a_problem(folder: Folder) -> None:
+    (said,) = folder.problems(terrain(""))
+    assert "'hill.png' cannot be found" in said
+    folder.write("hill.png", "no picture")
+    (said,) = folder.problems(terrain(""))
+    assert "no heights can be read from it" in said
+    assert "MuJoCo reads PNG" in said

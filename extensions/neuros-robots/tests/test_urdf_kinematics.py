@@ -1,23 +1,21 @@
-"""Robots in URDF are where their joints put them: by hand, and by MuJoCo's own reader."""
+"""Robots in URDF are where their joints put them; ``tests/corpus`` compares those of others."""
 
 from __future__ import annotations
 
-import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from kinematics import axes, matrix_of, poses, shift, turn
+from kinematics import axes, poses
 from neuros_robots.elements import Finder
 from neuros_robots.urdf import read_urdf
-from public_packages import each_robot, unpacked
 
 from neuros.errors import DescriptionError, Problem
+from tests.corpus.independent import matrix_of, shift, turn
 
 many = settings(
     max_examples=30,
@@ -112,50 +110,3 @@ def test_no_change_ends_in_anything_but_a_model_or_problems(
     except DescriptionError as error:
         problems += error.problems
     assert all(problem.line >= 1 and problem.text for problem in problems)
-
-
-@each_robot
-def test_a_public_robot_has_the_kinematics_of_mujocos_reader(requirement: str, name: str) -> None:
-    folder = unpacked(requirement)
-    robot = folder / name
-    converted = read_urdf(robot, Finder([folder]))
-    model = converted.spec.compile()
-    text = re.sub(r"<!--.*?-->|<\?.*?\?>", "", robot.read_text("utf-8", "replace"), flags=re.DOTALL)
-    root = ElementTree.fromstring(text.strip())
-    weighed = sum(float(mass.get("value", 0)) for mass in root.findall("link/inertial/mass"))
-    assert model.body_mass.sum() == pytest.approx(weighed, rel=1e-6)
-    other = by_mujoco(root)
-    ours, theirs = mujoco.MjData(model), mujoco.MjData(other)
-    chance = np.random.default_rng(0)
-    for index in range(model.njnt):
-        joint = model.joint(index)
-        if joint.type[0] in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
-            position = chance.uniform(-1, 1)
-            ours.joint(joint.name).qpos[0] = theirs.joint(joint.name).qpos[0] = position
-    mujoco.mj_kinematics(model, ours)
-    mujoco.mj_kinematics(other, theirs)
-    for index in range(1, model.nbody):
-        body = ours.body(model.body(index).name)
-        np.testing.assert_allclose(body.xpos, theirs.body(body.name).xpos, atol=1e-9)
-        np.testing.assert_allclose(body.xmat, theirs.body(body.name).xmat, atol=1e-9)
-
-
-def by_mujoco(root: ElementTree.Element) -> Any:
-    """The model that MuJoCo's own reader makes of the links and joints alone."""
-    bare = ElementTree.Element("robot", root.attrib)
-    block = ElementTree.SubElement(bare, "mujoco")
-    more = {"fusestatic": "false", "boundmass": "1e-6", "boundinertia": "1e-6"}
-    ElementTree.SubElement(block, "compiler", {**more, "balanceinertia": "true"})
-    for element in root:
-        if element.tag == "link":
-            link = ElementTree.SubElement(bare, "link", element.attrib)
-            mass = 'mass value="1"', 'inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"'
-            text = f"<inertial>{''.join(f'<{row}/>' for row in mass)}</inertial>"
-            link.append(ElementTree.fromstring(text))
-        elif element.tag == "joint":
-            joint = ElementTree.SubElement(bare, "joint", element.attrib)
-            kept = ("origin", "parent", "child", "axis")
-            joint.extend(child for child in element if child.tag in kept)
-            if element.get("type") in ("revolute", "prismatic"):
-                ElementTree.SubElement(joint, "limit", {"lower": "-9", "upper": "9"})
-    return mujoco.MjSpec.from_string(ElementTree.tostring(bare, "unicode")).compile()

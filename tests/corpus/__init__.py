@@ -1,0 +1,1 @@
+"""Robots and messages of others: packages of registries, read by NeuROS and by something else."""
