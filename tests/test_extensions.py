@@ -284,3 +284,15 @@ def test_a_module_that_nobody_has_is_not_found(lab: Path) -> None:
     assert output_of("import neuros.nothing", lab).endswith(
         "ModuleNotFoundError: No module named 'neuros.nothing'\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("file", "line"),
+    [
+        ("package.xml", "<version>{}</version>"),
+        ("CITATION.cff", "version: {}"),
+        ("conda/recipe.yaml", 'version: "{}"'),
+    ],
+)
+def test_files_for_other_indexes_have_its_version(file: str, line: str) -> None:
+    assert line.format(__version__) in (ROOT / file).read_text("utf-8")
