@@ -12,7 +12,7 @@ from benchmarks import dora, page, subjects
 from benchmarks.measure import Case, Figure, Group, Subject, Unavailable
 from benchmarks.results import Results
 from benchmarks.targets import BOUNDS, TARGETS
-from neuros.cli import setup
+from neuros.cli import machine
 from neuros.cli.main import main
 from neuros.errors import UsageError
 
@@ -106,7 +106,7 @@ def test_wrong_usage_is_one_sentence(
 def test_without_a_source_checkout_it_says_what_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(setup, "ROOT", tmp_path)
+    monkeypatch.setattr(machine, "ROOT", tmp_path)
     assert main(["benchmark", "engine"]) == 4
     assert f"no benchmarks in {tmp_path}: they are part of the source" in capsys.readouterr().err
 
