@@ -89,10 +89,11 @@ def measure(
         UsageError: if there is no such commit.
         EnvironmentFault: if it cannot be installed, or a measurement fails.
     """
-    other = installed(landed() if commit == LANDED else commit, say)
-    if lacking := [name for name in subjects if not _has_subject(other, name)]:
-        say(f"{other.name} does not have {', '.join(lacking)}: there is nothing to compare with")
+    commit = landed() if commit == LANDED else commit
+    if lacking := {*subjects} - subjects_of(commit):
+        say(f"{commit} does not have {', '.join(lacking)}: there is nothing to compare with")
         return []
+    other = installed(commit, say)
     count = rounds or (QUICK_ROUNDS if is_quick else ROUNDS)
     arguments = [*subjects, *(["-k", rows] if rows else []), *(["--quick"] if is_quick else [])]
     found: dict[tuple[str, str], tuple[list[float], list[float]]] = {}
@@ -124,12 +125,18 @@ def landed() -> str:
     return "HEAD^1"
 
 
+def subjects_of(commit: str) -> set[str]:
+    """The subjects that a commit has."""
+    listed = _git("ls-tree", "--name-only", _named(commit), "benchmarks/subjects/").decode()
+    return {Path(line).stem for line in listed.splitlines()}
+
+
 def installed(commit: str, say: Callable[[str], None]) -> Path:
     """The folder with a commit, which is kept for the next time.
 
     It has a ``.venv`` of its own if it requires other packages than this one.
     """
-    named = _git("rev-parse", "--verify", "--quiet", f"{commit}^{{commit}}").decode().strip()
+    named = _named(commit)
     folder = ROOT / "build" / "benchmarks" / "commits" / named[:12]
     complete = folder / ".complete"
     if not complete.is_file():
@@ -193,10 +200,6 @@ def _at_once(
             yield side, job.result()
 
 
-def _has_subject(tree: Path, name: str) -> bool:
-    return (tree / "benchmarks" / "subjects" / f"{name}.py").is_file()
-
-
 def _rows(tree: Path, arguments: Sequence[str], prefix: Sequence[str] = ()) -> list[dict[str, Any]]:
     """What one round in a checkout measures."""
     own = tree / ".venv" / "bin" / "python"
@@ -218,6 +221,10 @@ def _rows(tree: Path, arguments: Sequence[str], prefix: Sequence[str] = ()) -> l
             raise EnvironmentFault(f"{tree}: nothing was measured: {done.stderr[-500:]}")
         results: list[dict[str, Any]] = json.loads(file.read_text("utf-8"))["rows"]
         return results
+
+
+def _named(commit: str) -> str:
+    return _git("rev-parse", "--verify", "--quiet", f"{commit}^{{commit}}").decode().strip()
 
 
 def _git(*arguments: str) -> bytes:

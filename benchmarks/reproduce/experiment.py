@@ -5,7 +5,7 @@
     build/reproduce/<experiment>/<utc time>/     or what -o names
         reproduce.json                           this record, written after each run
         runs/<name>-<number>/                    what each run left behind
-        tables/, figures/, index.md, index.html  made of it, and made anew by --from
+        tables/, figures/, index.md              made of it, and made anew by --from
 """
 
 from __future__ import annotations

@@ -33,7 +33,6 @@ def write_results(experiment: Experiment, kind: Kind) -> Path:
                 (tables / f"{section.table.name}.md").write_text(text, "utf-8")
         write_runs(readings, tables / "runs.csv")
         page = Page(kind.title, [*_beginning(experiment, kind), *sections])
-        write_whole(folder / "index.html", page.html())
         write_whole(folder / "index.md", page.markdown(folder))
     except OSError as error:
         raise UsageError(f"{folder} cannot be written to ({error.strerror})") from error

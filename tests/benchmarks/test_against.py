@@ -51,9 +51,7 @@ def trees(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[Path]:
         value = 100.0 if tree == tmp_path else 120.0
         return [{"subject": "good", "name": "round trip", "unit": "us", "values": [value]}]
 
-    for name in ("good", "guard"):
-        (tmp_path / "benchmarks" / "subjects").mkdir(parents=True, exist_ok=True)
-        (tmp_path / "benchmarks" / "subjects" / f"{name}.py").touch()
+    monkeypatch.setattr(against, "subjects_of", lambda commit: {"good", "guard"})
     monkeypatch.setattr(against, "installed", lambda commit, say: tmp_path)
     monkeypatch.setattr(against, "_rows", rows)
     return measured
@@ -121,6 +119,14 @@ def commit(git: Callable[..., str], folder: Path, file: str, text: str) -> str:
     git("add", "--all")
     git("commit", "--quiet", "--message", file)
     return git("rev-parse", "HEAD")
+
+
+@pytest.mark.needs("git")
+def test_a_commit_has_its_own_subjects(repository: Callable[..., str], tmp_path: Path) -> None:
+    old = commit(repository, tmp_path, "benchmarks/subjects/tick.py", "")
+    commit(repository, tmp_path, "benchmarks/subjects/guard.py", "")
+    assert against.subjects_of(old) == {"tick"}
+    assert against.subjects_of("HEAD") == {"tick", "guard"}
 
 
 @pytest.mark.needs("git")

@@ -26,6 +26,7 @@ def rows(folder: Path) -> dict[str, dict[str, str]]:
         return {row["run"]: row for row in csv.DictReader(stream)}
 
 
+@pytest.mark.acceptance
 def test_ticks_of_neuros_and_of_bare_rclpy_are_measured_alike(tmp_path: Path) -> None:
     command = ["reproduce", "tick", "--duration", "3", "--backend", "process"]
     assert main([*command, "-o", str(tmp_path)]) == 0
@@ -70,6 +71,7 @@ def test_the_elevator_goes_on_for_as_long_as_it_is_measured(tmp_path: Path) -> N
     assert "| strict" in (tmp_path / "index.md").read_text()
 
 
+@pytest.mark.acceptance
 def test_voters_think_at_the_same_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(voting, "THINK_S", 0.25)
     voting.run("voting", tmp_path / "run", 1.0, "process")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -28,6 +29,12 @@ def test_each_subject_can_be_measured(name: str, tmp_path: Path) -> None:
         command, cwd=REPOSITORY, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    rows = Results.read(file).rows
-    assert rows
-    assert all(row.values for row in rows)
+    results = Results.read(file)
+    assert not any(notice.is_failure for notice in results.notices)
+    groups = subjects.load([name], is_quick=True)[name].groups
+    left_out = {notice.row for notice in results.notices}
+    assert {row.name for row in results.rows} == {
+        case.name for group in groups for case in group.cases
+    } - left_out
+    for row in results.rows:
+        assert all(map(math.isfinite, (*row.values, *row.references))), row.name

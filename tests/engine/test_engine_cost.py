@@ -72,21 +72,3 @@ def cost_of_a_packet(bench: Bench) -> int:
 @pytest.mark.parametrize("idle", [20, 200])
 def test_a_packet_costs_the_same_however_many_hooks_and_connections_rest(idle: int) -> None:
     assert cost_of_a_packet(relay_beside(idle)) == cost_of_a_packet(relay_beside(2))
-
-
-def test_what_the_garbage_collector_calls_is_not_counted() -> None:
-    def called(phase: str, _: dict[str, int]) -> int:
-        return len(phase)
-
-    def act() -> list[list[int]]:
-        return [[n] for n in range(100)]
-
-    expected, threshold = instructions(act), gc.get_threshold()
-    gc.callbacks.append(called)
-    gc.set_threshold(1)
-    try:
-        assert instructions(act) == expected
-    finally:
-        gc.set_threshold(*threshold)
-        gc.callbacks.remove(called)
-    assert gc.isenabled()

@@ -84,14 +84,6 @@ def test_a_blocked_output_counts_before_a_missing_input():
     assert bench.engine.rest() == Rest(State.BLOCKED, OUT)
 
 
-def test_its_own_packet_that_a_hook_would_take_does_not_block_it():
-    bench = Bench(
-        function("f", Optional("x"), "o", returns=1), connections=[wire(OWN, 0), wire(OUT, 0)]
-    )
-    bench.settle()
-    assert bench.engine.rest() == Rest(State.BLOCKED, OUT)
-
-
 @pytest.mark.parametrize("inputs", [None, "x"])
 def test_between_ticks_a_node_is_idle(inputs):
     bench = Bench(tick("t", 1.0, inputs), connections=[wire(IN)] if inputs else [])
@@ -219,15 +211,6 @@ def incoming(bench: Bench, name: str = IN) -> tuple[int, int, int, int]:
     return books["received"], books["consumed"], books["discarded"], books["unread"]
 
 
-def test_received_is_consumed_plus_discarded_plus_unread():
-    bench = Bench(function("f", ["x", "go"]), connections=[wire(IN, 9, 2), wire("c.o -> node.go")])
-    for _ in range(5):
-        bench.packet(IN)
-    assert incoming(bench) == (5, 0, 3, 2)
-    bench.packet("c.o -> node.go")
-    assert incoming(bench) == (5, 1, 3, 1)
-
-
 def two_takers() -> Bench:
     return Bench(
         function("f", ["x", "f_go"]),
@@ -313,12 +296,6 @@ def test_a_snapshot_is_plain_json_with_every_connection_and_hook():
     assert books["hooks"]["t"] == of_ticks
     assert books["state"] == {"state": "waiting", "cause": "x"}
     assert books["executing"] is None
-
-
-def test_a_best_effort_connection_has_nothing_outstanding():
-    bench = Bench(function("f", outputs="o", returns=1), connections=[wire(OUT)])
-    outgoing = snapshot(bench.engine, 0)["outgoing"][OUT]
-    assert (outgoing["sent"], outgoing["outstanding"], outgoing["is_reliable"]) == (1, 0, False)
 
 
 def test_a_read_that_is_disturbed_is_tried_again():

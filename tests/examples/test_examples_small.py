@@ -4,42 +4,14 @@ from __future__ import annotations
 
 import json
 import shutil
-import signal
 from pathlib import Path
 
-from launching import EXAMPLES, each_time, launch, start
+from launching import EXAMPLES, each_time, launch
 
-CLOCK = EXAMPLES / "1_tick/clock"
 TENNIS = EXAMPLES / "2_synchronisation/tennis"
 VOTING = EXAMPLES / "2_synchronisation/voting"
 
 pytestmark = each_time("in-process")
-
-
-def test_the_clock_ticks_until_its_time_is_over(backend: str, tmp_path: Path) -> None:
-    run = launch(CLOCK, "--backend", backend, "--duration", "1.5", cwd=tmp_path)
-    assert run.exit_code == 0, run.output
-    times = [text for text in run.said("display") if text.startswith("It is ")]
-    assert len(times) in (1, 2)
-    counted = run.connection("clock.time -> display.time")
-    assert counted["sent"] == counted["received"] == counted["consumed"] == len(times)
-
-
-def test_the_clock_ends_on_ctrl_c(backend: str, tmp_path: Path) -> None:
-    with start(CLOCK, "--backend", backend, cwd=tmp_path) as running:
-        running.wait_for("It is")
-        running.signal(signal.SIGINT)
-        assert running.finish().exit_code == 130
-
-
-def test_a_rally_has_ten_strokes(backend: str, tmp_path: Path) -> None:
-    run = launch(TENNIS, "--backend", backend, cwd=tmp_path)
-    assert run.exit_code == 0, run.output
-    assert run.said("ann") == [f"stroke {number}" for number in (1, 3, 5, 7, 9)]
-    assert run.said("bob") == [f"stroke {number}" for number in (2, 4, 6, 8, 10)]
-    for connection in run.record["connections"]:
-        assert connection["sent"] == connection["received"] == connection["consumed"] == 5
-    assert run.record["reason"].endswith("a rally of 10 strokes")
 
 
 def test_the_length_of_a_rally_can_be_set(backend: str, tmp_path: Path) -> None:

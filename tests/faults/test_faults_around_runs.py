@@ -17,12 +17,11 @@ from needs import require
 from containers import require_containers
 
 from . import interrupts, processes, surroundings
-from .__main__ import with_tables
 from .interrupts import Interrupt
 from .launches import launches
 from .processes import ProcessFault, process_faults
 from .surroundings import SurroundingCell
-from .trials import Outcome, Place
+from .trials import Outcome
 
 # Others are in tests/integration: killed launchers and recorders, and engines that go away.
 _FAULTS = (
@@ -109,24 +108,3 @@ def test_every_fault_of_a_process(fault: ProcessFault, tmp_path: Path) -> None:
 @pytest.mark.parametrize("cell", [*surroundings.surroundings()], ids=str)
 def test_every_surrounding(cell: SurroundingCell, tmp_path: Path) -> None:
     check_surrounding(cell, tmp_path)
-
-
-def test_a_table_that_is_made_in_part_keeps_its_other_cells() -> None:
-    def outcome(
-        row: str, column: str, exit_code: int, *problems: str, begins: bool = False
-    ) -> Outcome:
-        place = Place("faults, process", row, column, begins)
-        return Outcome(place, exit_code, "", 0.5, "complete", "", {}, list(problems))
-
-    marks = "before\n<!-- generated: faults, process -->\n<!-- generated: end -->\nafter\n"
-    whole = with_tables(marks, [outcome(row, at, 0) for row in "ab" for at in ("one", "two")])
-    assert "| `a` | 0, 0.5 s | 0, 0.5 s |" in whole
-    part = with_tables(whole, [outcome("b", "two", 1, "wrong")])
-    assert part == whole.replace(
-        "| `b` | 0, 0.5 s | 0, 0.5 s |", "| `b` | 0, 0.5 s | **1, 0.5 s: wrong** |"
-    )
-    assert part.startswith("before\n")
-    assert part.endswith("after\n")
-    anew = with_tables(part, [outcome("c", "one", 0, begins=True)])
-    assert "| `c` | 0, 0.5 s |" in anew
-    assert "`a`" not in anew

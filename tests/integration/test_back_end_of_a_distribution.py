@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from back_end_checks import BackEndChecks, Launched, finish, launcher
+from back_end_checks import COUNT, PROJECTS, BackEndChecks, finish, launcher
 from distributions import install, path_with
 
 CLOCK = Path(__file__).parents[2] / "examples/1_tick/clock"
@@ -22,16 +21,19 @@ def installed(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     return site
 
 
+@pytest.mark.acceptance
 class TestNice(BackEndChecks):
     back_end = "nice"
     options = ("--nice-level", "3")
 
-    def test_its_options_its_notices_and_its_record_are_those_of_the_run(
-        self, run: Callable[..., Launched]
-    ) -> None:
-        launched = run("pipeline")
-        assert "nodes have the nice level 3" in launched.output
-        assert launched.record["nice"] == {"level": 3}
+
+def test_its_options_its_notices_and_its_record_are_those_of_the_run(tmp_path: Path) -> None:
+    options = ("--backend", "nice", "--nice-level", "3")
+    launched = finish(launcher(PROJECTS / "pipeline", tmp_path / "run", *options), tmp_path / "run")
+    assert launched.exit_code == 0, launched.output
+    assert "nodes have the nice level 3" in launched.output
+    assert launched.record["nice"] == {"level": 3}
+    assert launched.counts("relay.number -> sink.number", "sent", "consumed") == [COUNT] * 2
 
 
 def neuros(*arguments: str) -> subprocess.CompletedProcess[str]:

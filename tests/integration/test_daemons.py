@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.launching import BACKENDS, Running, start
+from tests.support.launching import Running, start
 
 DAEMON = """
 import os, sys
@@ -95,8 +95,10 @@ def _start(tmp_path: Path, marks: Path, plugin: str, backend: str, script: str =
     return start(project, "--backend", backend, cwd=tmp_path, MARK=str(marks))
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("end", ENDS)
+@pytest.mark.parametrize(
+    ("backend", "end"),
+    [*(("process", end) for end in ENDS), ("in-process", "a launcher that is killed")],
+)
 def test_a_daemon_ends_with_the_run(tmp_path: Path, marks: Path, backend: str, end: str) -> None:
     last_act, number = ENDS[end]
     plugin = PLUGIN.replace("DAEMON", repr(DAEMON)).replace("LAST_ACT", last_act)
@@ -110,11 +112,10 @@ def test_a_daemon_ends_with_the_run(tmp_path: Path, marks: Path, backend: str, e
         _wait_until(lambda: not _daemons(marks), 6.0 if number == signal.SIGKILL else 0.0)
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
-def test_a_daemon_of_a_script_ends_with_the_run(tmp_path: Path, marks: Path, backend: str) -> None:
+def test_a_daemon_of_a_script_ends_with_the_run(tmp_path: Path, marks: Path) -> None:
     plugin = PLUGIN.replace("DAEMON", "'pass'").replace("LAST_ACT", "node.shutdown('done')")
     script = f"exec {sys.executable} -S - <<'END'\n{DAEMON}\nEND\n"
-    with _start(tmp_path, marks, plugin, backend, script) as running:
+    with _start(tmp_path, marks, plugin, "process", script) as running:
         assert running.finish().exit_code == 0
         assert [*marks.iterdir()]
         assert not _daemons(marks)

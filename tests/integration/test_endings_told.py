@@ -104,25 +104,19 @@ def close(node):
 """
 
 
-def test_each_node_has_its_five_seconds_and_its_counters_are_complete(bench: Bench) -> None:
-    """In process as elsewhere, though the three of them take 6 s there."""
-    bench.project("a.o -> c.x", a=SOURCE + ENDS + TAKES_2_S, b=RUNS + TAKES_2_S, c=SINK + TAKES_2_S)
-    finished = bench.launch()
-    assert_ended(finished, 0, "a ended the project: enough")
-    assert bench.saved("a", "b", "c")
-    counted = finished.connection("a.o -> c.x")
-    assert counted["sent"] == counted["received"] == counted["consumed"] > 0
-
-
-def test_two_ctrl_c_while_hooks_finalise_are_no_good_end(bench: Bench) -> None:
-    bench.project(a=RUNS + HANGS)
-    running = bench.start("--duration", "0.5")
-    running.wait_for("all is saved")
-    running.signal(2)
-    running.wait_for("already ending")
-    running.signal(2)
-    why = r"killed by Ctrl\+C before its nodes had ended: 0.5 s are over"
-    assert_ended(running.finish(5.0), 130, why)
+def test_each_node_of_a_process_has_its_five_seconds_and_its_counters_are_complete(
+    tmp_path: Path,
+) -> None:
+    """The three of them take 6 s."""
+    with made_bench(tmp_path, "in-process") as bench:
+        bench.project(
+            "a.o -> c.x", a=SOURCE + ENDS + TAKES_2_S, b=RUNS + TAKES_2_S, c=SINK + TAKES_2_S
+        )
+        finished = bench.launch()
+        assert_ended(finished, 0, "a ended the project: enough")
+        assert bench.saved("a", "b", "c")
+        counted = finished.connection("a.o -> c.x")
+        assert counted["sent"] == counted["received"] == counted["consumed"] > 0
 
 
 # ------------------------------------------------------------------ as Python programs end

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from launching import BACKENDS, launch
+from launching import launch
 
 PLUGIN = """
 import sys
@@ -19,35 +19,51 @@ def begin(node):
 @neuros_function(inputs="in", outputs="out")
 def step(node, packet):
     node.get_logger().info("a line")
-    node.shutdown("enough")
     found = [name for name in ("numpy", "yaml") if name in sys.modules]
     (node.run_dir / "modules").write_text(" ".join(found))
     return packet
 """
 
 
-@pytest.mark.parametrize("backend", BACKENDS)
+NUMPY = {
+    "std_msgs/msg/String": "",
+    "geometry_msgs/msg/Twist": "",
+    "rosgraph_msgs/msg/Clock": "",
+    "sensor_msgs/msg/Imu": "numpy",
+    "std_msgs/msg/Float64MultiArray": "",
+}
+
+
 @pytest.mark.parametrize(
-    ("type_name", "modules"),
+    ("backend", "types"),
     [
-        ("std_msgs/msg/String", ""),
-        ("geometry_msgs/msg/Twist", ""),
-        ("rosgraph_msgs/msg/Clock", ""),
-        ("sensor_msgs/msg/Imu", "numpy"),
-        ("std_msgs/msg/Float64MultiArray", ""),
+        ("process", [*NUMPY]),
+        ("in-process", ["std_msgs/msg/Float64MultiArray"]),
+        ("in-process", ["sensor_msgs/msg/Imu"]),
     ],
 )
 def test_a_node_has_numpy_only_for_arrays_and_no_yaml(
-    tmp_path: Path, backend: str, type_name: str, modules: str
+    tmp_path: Path, backend: str, types: list[str]
 ) -> None:
     (tmp_path / "a.py").write_text(PLUGIN)
-    port = {"type": type_name}
-    node = {"name": "a", "container": "neuros_python", "plugin": "a.py"}
-    node |= {"inputs": [{"name": "in", **port}], "outputs": [{"name": "out", **port}]}
-    loop = {"source_node": "a", "source_output": "out", "discard_limit": 0}
-    loop |= {"destination_node": "a", "destination_input": "in"}
-    (tmp_path / "p.json").write_text(json.dumps({"nodes": [node], "connections": [loop]}))
-    finished = launch(tmp_path / "p.json", "--backend", backend, cwd=tmp_path)
+    names = [f"node{number}" for number in range(len(types))]
+    nodes = [
+        {"name": name, "container": "neuros_python", "plugin": "a.py"}
+        | {
+            key: [{"name": port, "type": each}]
+            for key, port in (("inputs", "in"), ("outputs", "out"))
+        }
+        for name, each in zip(names, types, strict=True)
+    ]
+    loops = [
+        {"source_node": name, "source_output": "out", "discard_limit": 0}
+        | {"destination_node": name, "destination_input": "in"}
+        for name in names
+    ]
+    (tmp_path / "p.json").write_text(json.dumps({"nodes": nodes, "connections": loops}))
+    options = ("--backend", backend, "--duration", "0.2")
+    finished = launch(tmp_path / "p.json", *options, cwd=tmp_path)
     assert finished.exit_code == 0, finished.output
     assert finished.run_folder is not None
-    assert (finished.run_folder / "a" / "modules").read_text() == modules
+    for name, each in zip(names, types, strict=True):
+        assert (finished.run_folder / name / "modules").read_text() == NUMPY[each], each

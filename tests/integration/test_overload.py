@@ -23,7 +23,13 @@ PROJECT = Path(__file__).parent / "overload"
 DURATION_S = 6
 SLACK_S = 0.8
 TIMER_S = 0.25
-VARIANTS = ("process", "process on a wait set", "in-process", "docker")
+VARIANTS = (
+    "process",
+    "in-process",
+    # In containers nodes run as in processes; the loop on a wait set: test_executors.py.
+    pytest.param("process on a wait set", marks=pytest.mark.acceptance),
+    pytest.param("docker", marks=pytest.mark.acceptance),
+)
 
 
 class Take(NamedTuple):

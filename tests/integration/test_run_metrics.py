@@ -55,14 +55,6 @@ def test_what_was_consumed_has_the_digest_of_what_was_sent(run: Finished) -> Non
     assert digests["consumed"] == digests["sent"]
 
 
-def test_wall_time_of_every_node_is_divided_without_rest(run: Finished) -> None:
-    for node in run.record["nodes"].values():
-        spent = node["accounting"]
-        parts = sum(sum(spent[kind].values()) for kind in ("executing", "waiting", "blocked"))
-        parts += spent["idle"] + spent["registering"] + spent["scheduling"]
-        assert parts == pytest.approx(spent["total"], abs=1e-6)
-
-
 @pytest.mark.parametrize("back_end", BACKENDS)
 def test_simulated_time_has_a_point_per_second(tmp_path: Path, back_end: str) -> None:
     finished = launch(TIME, "--backend", back_end, "--duration", "2.5sim", cwd=tmp_path)

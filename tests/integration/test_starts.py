@@ -7,12 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from ending_bench import ENDS, SINK, Bench, assert_ended, made_bench
+from ending_bench import ENDS, Bench, assert_ended, made_bench
 from endings import GONE_WITHIN_S, RUNS
 from launching import BACKENDS
 from starts import (
     INITIALISES_SLOWLY,
-    LOADS_SLOWLY,
     MOMENTS,
     PLUGINS,
     TICKS,
@@ -22,16 +21,6 @@ from starts import (
 
 from neuros.backends.domain import choose_domain
 
-SENDS = """
-@neuros_tick(seconds=0.1, outputs="o")
-def send(node):
-    return node.make_packet("o")
-"""
-FIRST = """
-@neuros_initialise()
-def first(node):
-    pass
-"""
 SAVES = """
 @neuros_finalise()
 def save_weights(node):
@@ -97,30 +86,12 @@ def test_neither_do_they_before_a_node_of_another_launcher(tmp_path: Path, first
         assert bench.saved(*PLUGINS)
 
 
-def test_an_end_that_is_asked_for_at_once_finds_every_node_ready(bench: Bench) -> None:
-    bench.project(a=ENDS, b=LOADS_SLOWLY + TICKS)
-    finished = bench.launch()
-    assert_ended(finished, 0, "a ended the project: enough")
-    assert bench.saved("a", "b")
-    assert "?" not in finished.output
-
-
 def test_an_end_that_a_node_asks_for_as_it_initialises_waits_until_all_have(bench: Bench) -> None:
     ends = "@neuros_initialise()\ndef end(node):\n    node.shutdown('enough')\n"
     bench.project(a=ends + MOMENTS + TICKS, b=MOMENTS + INITIALISES_SLOWLY + TICKS)
     assert_ended(bench.launch(), 0, "a ended the project: enough")
     assert bench.saved("a", "b")
     assert set(moments(bench.folder)["b"]) == {"loaded", "initialising", "initialised"}
-
-
-def test_a_duration_is_counted_from_when_all_are_ready(bench: Bench) -> None:
-    bench.project("a.o -> b.x", a=LOADS_SLOWLY + SENDS, b=SINK + FIRST)
-    finished = bench.launch("--duration", "1.05")
-    assert_ended(finished, 0, "1.05 s are over")
-    hook = finished.record["nodes"]["a"]["hooks"]["send"]
-    assert abs(hook["executions"] + hook["missed_ticks"] - 10) <= 1
-    counted = finished.connection("a.o -> b.x")
-    assert counted["sent"] == counted["consumed"] == hook["executions"]
 
 
 def test_what_a_finalise_hook_saves_slowly_is_saved_to_its_end(bench: Bench) -> None:

@@ -16,7 +16,6 @@ import pytest
 from container_bench import HOLDS_THE_GIL, ContainerBench, container_bench
 from endings import GONE_WITHIN_S, RUNS
 from launching import EXAMPLES, Finished, Running, launch, start
-from starts import PLUGINS, assert_all_began_together
 from virtual_display import virtual_display
 
 from containers import require_containers, wait_until
@@ -32,8 +31,6 @@ from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import split
 from neuros.transport.dds_profile import LOCAL_PROFILES, PROFILES
-
-LARGE_PACKETS = Path(__file__).parents[1] / "large_packets"
 
 DRAWS = """
 from neuros.visualise import VisualiseLines
@@ -331,39 +328,6 @@ def test_a_node_that_is_killed_ends_the_others_properly(bench: ContainerBench) -
     assert bench.has_saved("b")
 
 
-def test_ctrl_c_ends_all_properly(bench: ContainerBench) -> None:
-    bench.project({"a": RUNS, "b": RUNS})
-    running = bench.start_and_wait("a", "b")
-    running.signal(signal.SIGINT)
-    finished = running.finish(10.0)
-    assert finished.exit_code == 130
-    assert bench.has_saved("a", "b")
-    assert bench.left() == []
-
-
-def test_no_hook_runs_before_all_have_loaded_and_no_tick_before_all_have_initialised(
-    bench: ContainerBench,
-) -> None:
-    bench.project(PLUGINS)
-    finished = bench.launch("--duration", "0.5")
-    assert finished.exit_code == 0, finished.output
-    assert_all_began_together(bench.folder)
-    assert bench.has_saved(*PLUGINS)
-
-
-def test_nodes_that_cannot_end_are_killed(bench: ContainerBench) -> None:
-    bench.project({"a": HOLDS_THE_GIL, "b": RUNS})
-    running = bench.start_and_wait("a", "b")
-    running.signal(signal.SIGINT)
-    finished = running.finish(15.0)
-    assert (
-        "node 'a' had to be killed after 5 s without progress: 'a' was still executing 'hold';"
-        " finalise hook 'save' of 'a' did not run" in finished.output
-    )
-    assert finished.exit_code == 130
-    assert bench.has_saved("b")
-
-
 @pytest.mark.parametrize("plugin", [RUNS, HOLDS_THE_GIL], ids=["busy", "holding the GIL"])
 def test_when_the_launcher_is_killed_no_container_outlives_it_by_six_seconds(
     bench: ContainerBench, plugin: str
@@ -376,17 +340,14 @@ def test_when_the_launcher_is_killed_no_container_outlives_it_by_six_seconds(
     assert bench.has_saved("b") or bench.has_saved("a", "b")
 
 
-@pytest.mark.parametrize("plugin", [RUNS, HOLDS_THE_GIL], ids=["busy", "holding the GIL"])
-def test_no_paused_container_outlives_a_killed_launcher_either(
-    bench: ContainerBench, plugin: str
-) -> None:
-    bench.project({"a": plugin, "b": RUNS})
+def test_no_paused_container_outlives_a_killed_launcher_either(bench: ContainerBench) -> None:
+    bench.project({"a": RUNS, "b": RUNS})
     running = bench.start_and_wait("a", "b")
     pause(bench, running)
     running.signal(signal.SIGKILL)
     running.process.wait()
     wait_until(lambda: not bench.left(), GONE_WITHIN_S)
-    assert bench.has_saved("b") or bench.has_saved("a", "b"), "it was resumed, and ended by itself"
+    assert bench.has_saved("a", "b"), "it was resumed, and ended by itself"
 
 
 @pytest.mark.acceptance
@@ -430,15 +391,6 @@ def test_a_container_that_somebody_else_stops_is_named_and_why(bench: ContainerB
         finished
     )
     assert bench.has_saved("a", "b")
-
-
-def test_two_runs_at_once_do_not_meet(bench: ContainerBench) -> None:
-    bench.project({"a": RUNS, "b": RUNS})
-    pair = [bench.start("--duration", "1"), bench.start("--duration", "1")]
-    finished = [running.finish(30.0) for running in pair]
-    assert [each.exit_code for each in finished] == [0, 0], finished
-    records = [json.loads(file.read_text()) for file in bench.folder.rglob("run.json")]
-    assert len({record["domain_id"] for record in records}) == 2
 
 
 # ------------------------------------------------------------------ what cannot be started
@@ -515,16 +467,6 @@ def test_a_name_that_is_taken_is_said_and_nothing_is_left(
 
 
 # ------------------------------------------------------------------ packets
-
-
-def test_images_go_from_container_to_container_without_loss(bench: ContainerBench) -> None:
-    finished = launch(LARGE_PACKETS, "--backend", "docker", cwd=bench.folder, timeout_s=60.0)
-    assert finished.exit_code == 0, finished.output
-    for counters in finished.record["connections"]:
-        if counters["discard_limit"] == 0:
-            assert counters["sent"] == counters["received"] > 0
-            assert counters["lost"] == 0
-    assert "go through DDS" not in finished.output, "they share memory"
 
 
 def test_whiskeye_runs_in_three_different_containers(bench: ContainerBench) -> None:

@@ -3,8 +3,7 @@
 import os
 
 import numpy as np
-from geometry_msgs.msg import Pose, PoseWithCovariance
-from std_msgs.msg import Float32MultiArray
+from geometry_msgs.msg import Pose
 
 from neuros.hooks import neuros_function, neuros_initialise, neuros_tick
 
@@ -29,20 +28,10 @@ def send(node):
     odometry.pose.covariance = np.eye(6, dtype=int)
     odometry.pose.covariance[1, 1] = np.float32(0.5)
     levels.data = [1, 0.1, float("inf")]
-    if WRONG == "text":
-        twist.linear.x = "fast"
-    elif WRONG == "nested":
+    if WRONG == "nested":
         poses.poses[3].position.y = "up"
-    elif WRONG == "range":
-        count.data = 300
-    elif WRONG == "fixed":
-        odometry.pose = PoseWithCovariance(covariance=["12"] * 36)
     elif WRONG == "element":
         odometry.pose.covariance[1, 1] = None
-    elif WRONG == "large":
-        levels.data = [0.5, 1e39]
-    elif WRONG == "made":
-        levels = Float32MultiArray(data=np.array([0.5, 1e39]))
     return twist, flag, colour, poses, count, own, odometry, levels
 
 
