@@ -37,14 +37,13 @@ from typing import TYPE_CHECKING
 
 from neuros.backends.containers import ContainerFolder
 from neuros.caching import Kept, cache_root
-from neuros.distribution import install_command, libraries, python_command
+from neuros.distribution import install_command, libraries
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import clean_environment, dotted
 from neuros.installation.packages import (
     InstallationFailed,
     Installer,
     explain_machine,
-    make_venv,
     why_unsatisfiable,
 )
 from neuros.installation.progress import Progress
@@ -184,14 +183,8 @@ def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]
             f"{entry.folder.parent} has {free_bytes / 1e9:.1f} GB free and a whole environment"
             f" needs {_FULL_BYTES / 1e9:.1f} GB: make room (df -h), or set XDG_CACHE_HOME",
         )
-    # A layer finds the pip of the launcher's environment.
-    options = ["--without-pip"] if choice.is_layered and _is_here("pip") else []
-    command = python_command("venv", *options, str(entry.folder), python=choice.base)
     try:
-        if why := make_venv(command, {**os.environ, **run_environment}):
-            raise _fault(choice, why)
-        _add_links(choice)
-        _install(choice, progress, run_environment)
+        _fill(choice, progress, run_environment)
         entry.record_use()
     except BaseException:
         entry.remove()
@@ -207,7 +200,7 @@ def _add_links(choice: Choice) -> None:
     if not choice.is_layered:
         return
     rows = [str(path) for path in packages_here()]
-    if _is_here(_BOOTSTRAPPER):
+    if any((here / _BOOTSTRAPPER).is_dir() for here in packages_here()):
         rows.append(f"import {_BOOTSTRAPPER}")
         # The wheels of ROS 2 look for their libraries and files below the prefix of their Python.
         prefix = Path(sys.prefix)
@@ -221,11 +214,8 @@ def _add_links(choice: Choice) -> None:
     (site_packages / "neuros_layer.pth").write_text("".join(f"{row}\n" for row in rows), "utf-8")
 
 
-def _is_here(package: str) -> bool:
-    return any((folder / package).is_dir() for folder in packages_here())
-
-
-def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
+def _fill(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
+    """Make the virtual environment, link what is here, and install what the container asks for."""
     entry, needs, file = choice.entry, own_needs(), choice.requirements.file
     if not needs:
         cause = f"neuros itself is not installed for {sys.executable}: {install_command()}"
@@ -233,9 +223,11 @@ def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, s
     progress.step(f"installing {file} (log: {entry.log})")
     environ = {**clean_environment(os.environ), **run_environment}
     entry.log.unlink(missing_ok=True)
-    installer = Installer(entry.future_python, entry.folder, entry.log, progress, environ)
+    installer = Installer(entry.future_python, entry.folder.parent, entry.log, progress, environ)
     wanted = ["--requirement", str(file)]
     try:
+        installer.make_environment(choice.base or Path(sys.executable))
+        _add_links(choice)
         if choice.requirements.has_hashes:
             # uv refuses requirements without a hash, so those of NeuROS are installed first.
             if not choice.is_layered:
