@@ -183,12 +183,36 @@ def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]
             f"{entry.folder.parent} has {free_bytes / 1e9:.1f} GB free and a whole environment"
             f" needs {_FULL_BYTES / 1e9:.1f} GB: make room (df -h), or set XDG_CACHE_HOME",
         )
+    needs, file = own_needs(), choice.requirements.file
+    if not needs:
+        cause = f"neuros itself is not installed for {sys.executable}: {install_command()}"
+        raise _fault(choice, cause)
+    progress.step(f"installing {file} (log: {entry.log})")
+    environ = {**clean_environment(os.environ), **run_environment}
+    entry.log.unlink(missing_ok=True)
+    installer = Installer(entry.future_python, entry.folder.parent, entry.log, progress, environ)
+    wanted = ["--requirement", str(file)]
     try:
-        _fill(choice, progress, run_environment)
+        installer.make_environment(choice.base or Path(sys.executable))
+        _add_links(choice)
+        if choice.requirements.has_hashes:
+            # uv refuses requirements without a hash, so those of NeuROS are installed first.
+            if not choice.is_layered:
+                installer.install(needs)
+            wanted, needs = ["--require-hashes", *wanted], []
+        elif choice.is_layered:
+            # uv does not see this environment through the layer, so it plans for this environment.
+            plan = ["--dry-run", "--break-system-packages", *wanted, *needs]
+            planned = _PLANNED.findall(installer.install(plan, Path(sys.executable)))
+            wanted, needs = ["--no-deps", *planned, *choice.requirements.editable], []
+        installer.install([*wanted, *needs])
         entry.record_use()
-    except BaseException:
+    except BaseException as error:
         entry.remove()
-        raise
+        if not isinstance(error, InstallationFailed):
+            raise
+        cause = why_uv_failed(error.output, dotted(choice.version), needs)
+        raise _fault(choice, f"{cause} (log: {entry.log})") from error
 
 
 def _add_links(choice: Choice) -> None:
@@ -212,36 +236,6 @@ def _add_links(choice: Choice) -> None:
             (site_packages / path.name).symlink_to(path)
     # Python searches lines of a .pth file after the environment's own packages.
     (site_packages / "neuros_layer.pth").write_text("".join(f"{row}\n" for row in rows), "utf-8")
-
-
-def _fill(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    """Make the virtual environment, link what is here, and install what the container asks for."""
-    entry, needs, file = choice.entry, own_needs(), choice.requirements.file
-    if not needs:
-        cause = f"neuros itself is not installed for {sys.executable}: {install_command()}"
-        raise _fault(choice, cause)
-    progress.step(f"installing {file} (log: {entry.log})")
-    environ = {**clean_environment(os.environ), **run_environment}
-    entry.log.unlink(missing_ok=True)
-    installer = Installer(entry.future_python, entry.folder.parent, entry.log, progress, environ)
-    wanted = ["--requirement", str(file)]
-    try:
-        installer.make_environment(choice.base or Path(sys.executable))
-        _add_links(choice)
-        if choice.requirements.has_hashes:
-            # uv refuses requirements without a hash, so those of NeuROS are installed first.
-            if not choice.is_layered:
-                installer.install(needs)
-            wanted, needs = ["--require-hashes", *wanted], []
-        elif choice.is_layered:
-            # uv does not see this environment through the layer, so it plans for this environment.
-            plan = ["--dry-run", "--break-system-packages", *wanted, *needs]
-            planned = _PLANNED.findall(installer.install(plan, Path(sys.executable)))
-            wanted, needs = ["--no-deps", *planned, *choice.requirements.editable], []
-        installer.install([*wanted, *needs])
-    except InstallationFailed as failure:
-        cause = why_uv_failed(failure.output, dotted(choice.version), needs)
-        raise _fault(choice, f"{cause} (log: {entry.log})") from failure
 
 
 def _words(choice: Choice) -> str:

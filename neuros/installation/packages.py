@@ -229,7 +229,7 @@ class Installer:
     def _settings(self) -> Mapping[str, str]:
         """The environment of uv, which reads none of pip's files and variables: pip lists them."""
         listing = ""
-        for python in (self.python, sys.executable):  # the environment of a container has no pip
+        for python in (self.python, Path(sys.executable)):  # that of a container has no pip
             pip = python_command("pip", "config", "list", python=python)
             if (answer := answer_of(pip, self.environ)) and not answer.returncode:
                 listing = answer.stdout
