@@ -33,7 +33,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from neuros.backends.containers import ContainerFolder
 from neuros.caching import Kept, cache_root
@@ -47,9 +46,6 @@ from neuros.installation.packages import (
     why_unsatisfiable,
 )
 from neuros.installation.progress import Progress
-
-if TYPE_CHECKING:
-    from packaging.requirements import Requirement
 
 Version = tuple[int, int]
 HERE: Version = sys.version_info[:2]
@@ -386,7 +382,11 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
             if not line.is_constraint:
                 yield f"{text} (not installed)"
             continue
-        if not (any_version or _fits(wanted, installed)):
+        fits = any_version or wanted.specifier.contains(version, prereleases=True)
+        if wanted.url and not any_version:
+            origin = installed.read_text("direct_url.json")
+            fits = origin is not None and json.loads(origin).get("url") == wanted.url
+        if not fits:
             yield f"{text} ({version} is installed)"
             continue
         # What an extra adds is a requirement, too; other dependencies came with the package.
@@ -394,10 +394,3 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
             seen.add(name)
             needs = [Requirement(need) for need in installed.requires or () if "extra" in need]
             pending += [(need, name) for need in needs]
-
-
-def _fits(wanted: Requirement, installed: importlib.metadata.Distribution) -> bool:
-    if wanted.url:
-        origin = installed.read_text("direct_url.json")
-        return origin is not None and json.loads(origin).get("url") == wanted.url
-    return wanted.specifier.contains(installed.version, prereleases=True)
