@@ -43,31 +43,24 @@ COMMANDS = {
     "types": Subcommand(
         "neuros.cli.projects", "let editors know the fields of a project's messages"
     ),
-    "build": Subcommand("neuros.cli.setup", "build message packages"),
+    "build": Subcommand("neuros.cli.machine", "build message packages"),
     "ps": Subcommand("neuros.cli.live", "show the runs of this user"),
     "stop": Subcommand("neuros.cli.live", "stop a run, as Ctrl+C does"),
     "topic": Subcommand("neuros.cli.live", "show the topics and packets of a run in progress"),
     "logs": Subcommand("neuros.cli.live", "show what the nodes of a run have logged"),
     "verify": Subcommand("neuros.cli.runs", "compare the packets of two runs"),
     "bag": Subcommand("neuros.cli.runs", "show or complete what a run has recorded"),
-    "replay": Subcommand(
-        "neuros.cli.replay", "run one node of a recorded run again, or publish recorded topics"
-    ),
-    "doctor": Subcommand("neuros.cli.setup", "check this machine, and prove that packets arrive"),
+    "doctor": Subcommand("neuros.cli.machine", "check this machine, and prove that packets arrive"),
     "containers": Subcommand(
-        "neuros.cli.setup", "build, list and remove the images that nodes run in"
+        "neuros.cli.machine", "build, list and remove the images that nodes run in"
     ),
     "benchmark": Subcommand(
-        "neuros.cli.setup", "measure what NeuROS costs, compared with the same program without it"
+        "neuros.cli.machine", "measure what NeuROS costs, compared with the same program without it"
     ),
-    "reproduce": Subcommand("neuros.cli.setup", "repeat the published experiments"),
-    "fork": Subcommand(
-        "neuros.cli.fork", "run a past run again up to a moment, then go on with a change"
-    ),
+    "reproduce": Subcommand("neuros.cli.machine", "repeat the published experiments"),
     "node": Subcommand("neuros.cli.node"),
     "import-plugin": Subcommand("neuros.cli.projects"),
     "recorder": Subcommand("neuros.cli.recorder"),
-    "replayed": Subcommand("neuros.cli.replay"),
 }
 """Of NeuROS itself; ``neuros.registry.SUBCOMMANDS`` has those of extensions."""
 
