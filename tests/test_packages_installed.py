@@ -263,6 +263,7 @@ class TestInstaller:
         stream, folder = StringIO(), python.parent.parent
         make_wheel(Path(environ["PIP_FIND_LINKS"]), "neuros_colour", "1.0", "NAME = 'red'")
         installer = Installer(python, folder, folder / "log", Progress(stream), environ)
+        installer.require_uv()
         installer.install(["neuros_colour"])
         return stream.getvalue()
 

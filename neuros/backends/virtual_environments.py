@@ -33,24 +33,19 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from neuros.backends.containers import ContainerFolder
 from neuros.caching import Kept, cache_root
-from neuros.distribution import install_command, libraries, python_command
+from neuros.distribution import install_command, libraries
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import clean_environment, dotted
 from neuros.installation.packages import (
     InstallationFailed,
     Installer,
     explain_machine,
-    make_venv,
     why_unsatisfiable,
 )
 from neuros.installation.progress import Progress
-
-if TYPE_CHECKING:
-    from packaging.requirements import Requirement
 
 Version = tuple[int, int]
 HERE: Version = sys.version_info[:2]
@@ -184,58 +179,18 @@ def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]
             f"{entry.folder.parent} has {free_bytes / 1e9:.1f} GB free and a whole environment"
             f" needs {_FULL_BYTES / 1e9:.1f} GB: make room (df -h), or set XDG_CACHE_HOME",
         )
-    # A layer finds the pip of the launcher's environment.
-    options = ["--without-pip"] if choice.is_layered and _is_here("pip") else []
-    command = python_command("venv", *options, str(entry.folder), python=choice.base)
-    try:
-        if why := make_venv(command, {**os.environ, **run_environment}):
-            raise _fault(choice, why)
-        _add_links(choice)
-        _install(choice, progress, run_environment)
-        entry.record_use()
-    except BaseException:
-        entry.remove()
-        raise
-
-
-def _add_links(choice: Choice) -> None:
-    """Link NeuROS and its extensions, and for a layer the packages of this environment."""
-    folder = choice.entry.folder
-    site_packages = folder / "lib" / f"python{dotted(choice.version)}" / "site-packages"
-    for name, place in libraries().items():
-        (site_packages / name).symlink_to(place, target_is_directory=True)
-    if not choice.is_layered:
-        return
-    rows = [str(path) for path in packages_here()]
-    if _is_here(_BOOTSTRAPPER):
-        rows.append(f"import {_BOOTSTRAPPER}")
-        # The wheels of ROS 2 look for their libraries and files below the prefix of their Python.
-        prefix = Path(sys.prefix)
-        for path in (*(prefix / "lib").iterdir(), prefix / "share"):
-            link = folder / path.relative_to(prefix)
-            if not path.name.startswith("python") and path.exists() and not link.exists():
-                link.symlink_to(path)
-        for path in (path for here in packages_here() for path in here.glob("ros_*.libs")):
-            (site_packages / path.name).symlink_to(path)
-    # Python searches lines of a .pth file after the environment's own packages.
-    (site_packages / "neuros_layer.pth").write_text("".join(f"{row}\n" for row in rows), "utf-8")
-
-
-def _is_here(package: str) -> bool:
-    return any((folder / package).is_dir() for folder in packages_here())
-
-
-def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, str]) -> None:
-    entry, needs, file = choice.entry, own_needs(), choice.requirements.file
+    needs, file = own_needs(), choice.requirements.file
     if not needs:
         cause = f"neuros itself is not installed for {sys.executable}: {install_command()}"
         raise _fault(choice, cause)
     progress.step(f"installing {file} (log: {entry.log})")
     environ = {**clean_environment(os.environ), **run_environment}
     entry.log.unlink(missing_ok=True)
-    installer = Installer(entry.future_python, entry.folder, entry.log, progress, environ)
+    installer = Installer(entry.future_python, entry.folder.parent, entry.log, progress, environ)
     wanted = ["--requirement", str(file)]
     try:
+        installer.make_environment(choice.base or Path(sys.executable))
+        _add_links(choice)
         if choice.requirements.has_hashes:
             # uv refuses requirements without a hash, so those of NeuROS are installed first.
             if not choice.is_layered:
@@ -247,9 +202,36 @@ def _install(choice: Choice, progress: Progress, run_environment: Mapping[str, s
             planned = _PLANNED.findall(installer.install(plan, Path(sys.executable)))
             wanted, needs = ["--no-deps", *planned, *choice.requirements.editable], []
         installer.install([*wanted, *needs])
-    except InstallationFailed as failure:
-        cause = why_uv_failed(failure.output, dotted(choice.version), needs)
-        raise _fault(choice, f"{cause} (log: {entry.log})") from failure
+        entry.record_use()
+    except BaseException as error:
+        entry.remove()
+        if not isinstance(error, InstallationFailed):
+            raise
+        cause = why_uv_failed(error.output, dotted(choice.version), needs)
+        raise _fault(choice, f"{cause} (log: {entry.log})") from error
+
+
+def _add_links(choice: Choice) -> None:
+    """Link NeuROS and its extensions, and for a layer the packages of this environment."""
+    folder = choice.entry.folder
+    site_packages = folder / "lib" / f"python{dotted(choice.version)}" / "site-packages"
+    for name, place in libraries().items():
+        (site_packages / name).symlink_to(place, target_is_directory=True)
+    if not choice.is_layered:
+        return
+    rows = [str(path) for path in packages_here()]
+    if any((here / _BOOTSTRAPPER).is_dir() for here in packages_here()):
+        rows.append(f"import {_BOOTSTRAPPER}")
+        # The wheels of ROS 2 look for their libraries and files below the prefix of their Python.
+        prefix = Path(sys.prefix)
+        for path in (*(prefix / "lib").iterdir(), prefix / "share"):
+            link = folder / path.relative_to(prefix)
+            if not path.name.startswith("python") and path.exists() and not link.exists():
+                link.symlink_to(path)
+        for path in (path for here in packages_here() for path in here.glob("ros_*.libs")):
+            (site_packages / path.name).symlink_to(path)
+    # Python searches lines of a .pth file after the environment's own packages.
+    (site_packages / "neuros_layer.pth").write_text("".join(f"{row}\n" for row in rows), "utf-8")
 
 
 def _words(choice: Choice) -> str:
@@ -400,7 +382,11 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
             if not line.is_constraint:
                 yield f"{text} (not installed)"
             continue
-        if not (any_version or _fits(wanted, installed)):
+        fits = any_version or wanted.specifier.contains(version, prereleases=True)
+        if wanted.url and not any_version:
+            origin = installed.read_text("direct_url.json")
+            fits = origin is not None and json.loads(origin).get("url") == wanted.url
+        if not fits:
             yield f"{text} ({version} is installed)"
             continue
         # What an extra adds is a requirement, too; other dependencies came with the package.
@@ -408,10 +394,3 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
             seen.add(name)
             needs = [Requirement(need) for need in installed.requires or () if "extra" in need]
             pending += [(need, name) for need in needs]
-
-
-def _fits(wanted: Requirement, installed: importlib.metadata.Distribution) -> bool:
-    if wanted.url:
-        origin = installed.read_text("direct_url.json")
-        return origin is not None and json.loads(origin).get("url") == wanted.url
-    return wanted.specifier.contains(installed.version, prereleases=True)

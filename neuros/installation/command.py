@@ -21,6 +21,7 @@ from neuros.installation.machine import (
     NEWEST_FOR_NEST,
     OLDEST,
     Machine,
+    answer_of,
     clean_environment,
     dotted,
     explain_missing_library,
@@ -60,14 +61,7 @@ def main(arguments: Sequence[str], root: str) -> int:
         if options.test:
             prepare_tests(folder)
         environment.install()
-        if code := build_messages(environment.python, folder):
-            progress.fail("install.py: NeuROS is installed, but not all message packages are built")
-            return code
-        if not options.no_containers and (code := build_containers(environment.python, options)):
-            progress.fail("install.py: NeuROS is installed, but not all images were built")
-            return code
-        if options.docs and (code := build_documentation(environment.python, folder)):
-            progress.fail("install.py: NeuROS is installed, but its documentation was not built")
+        if code := build(environment.python, folder, options, progress):
             return code
         if options.test:
             progress.step("installed; running the checks and tests")
@@ -190,22 +184,25 @@ def _agrees(folder: Path) -> bool:
     return answer.strip().lower() in ("", "y", "yes")
 
 
-def build_containers(python: Path, options: argparse.Namespace) -> int:
-    """Build images that are missing or out of date; returns an exit code.
+def build(python: Path, root: Path, options: argparse.Namespace, progress: Progress) -> int:
+    """Build messages, images and the documentation, as asked for; returns an exit code.
 
-    Without Docker and without a container named by the user, this only prints a line.
+    Without a C compiler, or without Docker and a container named by the user, a line says so.
     """
-    command = python_command("neuros.cli", *build_arguments(options), python=python)
-    return subprocess.call(command, env=clean_environment(os.environ))
-
-
-def build_messages(python: Path, root: Path) -> int:
-    """Build the message packages of NeuROS's workspace; returns an exit code.
-
-    Without a C compiler this only prints a line.
-    """
-    command = python_command("neuros.cli", "build", "--if-compiler", python=python)
-    return subprocess.call(command, cwd=root, env=clean_environment(os.environ))
+    messages = ("build", "--if-compiler", "--project", str(root))
+    steps = {
+        "not all message packages are built": python_command("neuros.cli", *messages, python=python)
+    }
+    if not options.no_containers:
+        images = build_arguments(options)
+        steps["not all images were built"] = python_command("neuros.cli", *images, python=python)
+    if options.docs:
+        steps["its documentation was not built"] = [str(python), str(root / "docs" / "make.py")]
+    for without, command in steps.items():
+        if code := subprocess.call(command, env=clean_environment(os.environ)):
+            progress.fail(f"install.py: NeuROS is installed, but {without}")
+            return code
+    return 0
 
 
 def build_arguments(options: argparse.Namespace) -> Sequence[str]:
@@ -218,12 +215,6 @@ def build_arguments(options: argparse.Namespace) -> Sequence[str]:
     if options.ca_bundle:
         arguments += ["--ca-bundle", options.ca_bundle]
     return [*arguments, *(["--pull"] if options.pull else [])]
-
-
-def build_documentation(python: Path, root: Path) -> int:
-    """Build ``docs/build/html``; returns an exit code. Sphinx prints the errors."""
-    command = [str(python), str(root / "docs" / "make.py")]
-    return subprocess.call(command, env=clean_environment(os.environ))
 
 
 # Code that runs only where the libraries of an extra load; "" is NeuROS itself. It also compiles
@@ -343,10 +334,12 @@ class Environment:
         try:
             # A virtual environment that was moved or copied calls the programs of the old one.
             is_ours = str(self.folder) in (self.folder / "bin" / "pip").read_text("utf-8")[:1000]
-            answer = self._run("import sys, pip; print(*sys.version_info[:2])")
-            major, minor = map(int, answer.stdout.split())
-        except (OSError, ValueError, subprocess.TimeoutExpired):
+        except (OSError, ValueError):
             return None
+        answer = self._run("import sys, pip; print(*sys.version_info[:2])")
+        if answer is None or answer.returncode:
+            return None
+        major, minor = map(int, answer.stdout.split())
         return (major, minor) if is_ours and OLDEST <= (major, minor) <= NEWEST else None
 
     def _make(self) -> tuple[int, int]:
@@ -371,32 +364,23 @@ class Environment:
         self._progress.detail("importing what was installed")
         names = [name for name in _PROOFS if not name or name in self.extras]
         with ThreadPoolExecutor() as threads:
-            faults = list(threads.map(self._fault_of, names))
-        return [fault for fault in faults if fault]
+            answers = list(
+                threads.map(lambda name: self._run(f"import neuros; {_PROOFS[name]}"), names)
+            )
+        faults = []
+        for name, answer in zip(names, answers, strict=True):
+            if answer is None or answer.returncode:
+                said = f"no answer in {_PROOF_TIMEOUT_S:g} s"
+                if answer is not None:
+                    said = answer.stderr.strip() or f"exit code {answer.returncode}"
+                faults.append(
+                    f"{_TITLES.get(name, name)} does not import ({said.splitlines()[-1]})"
+                )
+        return faults
 
-    def _fault_of(self, name: str) -> str:
-        try:
-            answer = self._run(f"import neuros; {_PROOFS[name]}")
-        except subprocess.TimeoutExpired as error:
-            why = str(error)
-        else:
-            rows = answer.stderr.strip().splitlines() or [f"exit code {answer.returncode}"]
-            why = rows[-1] if answer.returncode else ""
-        return why and f"{_TITLES.get(name, name)} does not import ({why})"
-
-    def _run(self, code: str) -> subprocess.CompletedProcess[str]:
-        """Run ``code`` in the Python of ``.venv``, from a folder without modules."""
-        return subprocess.run(
-            python_command(code=code, python=self.python),
-            cwd=self.folder,
-            # NEST fixes the number of its threads when it is imported. An empty variable is unset.
-            env={
-                **clean_environment(os.environ),
-                "OMP_NUM_THREADS": "1",
-                "PYTHONDONTWRITEBYTECODE": "",
-            },
-            capture_output=True,
-            text=True,
-            timeout=_PROOF_TIMEOUT_S,
-            check=False,
-        )
+    def _run(self, code: str) -> subprocess.CompletedProcess[str] | None:
+        """Run ``code`` in the Python of ``.venv``; ``None`` if it does not start or end in time."""
+        # NEST fixes the number of its threads when it is imported. An empty variable is unset.
+        further = {"OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": ""}
+        command = python_command(code=code, python=self.python)
+        return answer_of(command, {**clean_environment(os.environ), **further}, _PROOF_TIMEOUT_S)

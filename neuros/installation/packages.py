@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from neuros.distribution import python_command
+from neuros.distribution import install_command, python_command
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import (
     IN_DOCKER,
@@ -187,18 +187,23 @@ class Installer:
     progress: Progress
     environ: Mapping[str, str]
 
-    def require_uv(self, what: Sequence[str] = (UV,)) -> Path:
-        """The uv to use; where there is none, pip installs it beside Python.
+    def require_uv(self, what: Sequence[str] = (UV,)) -> None:
+        """Where there is no uv, install it with pip beside Python.
 
         Raises:
             InstallationFailed: if pip cannot.
             OSError: if pip cannot be started, or the log cannot be written.
         """
-        if found := find_uv(self.python):
-            return found
-        self.progress.detail("installing uv")
-        self._run(python_command(*_PIP_INSTALL, *what, python=self.python), self.environ)
-        return self.python.with_name("uv")
+        if not find_uv(self.python):
+            self.progress.detail("installing uv")
+            self._run(python_command(*_PIP_INSTALL, *what, python=self.python), self.environ)
+
+    def make_environment(self, base: Path) -> None:
+        """Make the virtual environment of ``python``, without pip, with the Python ``base``.
+
+        Raises ``InstallationFailed``, ``OSError``.
+        """
+        self._uv(["venv", "--no-project", "--python", str(base), str(self.python.parents[1])])
 
     def install(self, arguments: Sequence[str], python: Path | None = None) -> str:
         """Run ``uv pip install``, with pip's settings; returns what it wrote.
@@ -207,29 +212,39 @@ class Installer:
             python: for which Python, if not for this installer's.
 
         Raises:
-            InstallationFailed: if uv fails, or is not there and cannot be installed.
+            InstallationFailed: if uv fails, or is not there.
             OSError: if it cannot be started, or the log cannot be written.
         """
         environ = dict(self._settings)
         if "--require-hashes" in arguments:
             # Lock files name every version, and uv refuses a constraint without a hash.
             environ.pop("UV_CONSTRAINT", None)
-        command = [str(self.require_uv()), *_UV_INSTALL, "--python", str(python or self.python)]
+        command = [*_UV_INSTALL, "--python", str(python or self.python)]
         # uv has this variable as an option only.
         if environ.get("UV_NO_INDEX", "0").lower() not in ("0", "no", "off", "false"):
             command.append("--no-index")
-        return self._run([*command, *arguments], environ)
+        return self._uv([*command, *arguments], environ)
 
     @cached_property
     def _settings(self) -> Mapping[str, str]:
         """The environment of uv, which reads none of pip's files and variables: pip lists them."""
-        pip = python_command("pip", "config", "list", python=self.python)
-        listing = answer_of(pip, self.environ)
-        environ, unknown = uv_environment(listing.stdout if listing else "", self.environ)
+        listing = ""
+        for python in (self.python, Path(sys.executable)):  # that of a container has no pip
+            pip = python_command("pip", "config", "list", python=python)
+            if (answer := answer_of(pip, self.environ)) and not answer.returncode:
+                listing = answer.stdout
+                break
+        environ, unknown = uv_environment(listing, self.environ)
         if unknown:
             names = ", ".join(unknown)
             self.progress.step(f"uv has no setting like pip's {names}, and goes without")
         return environ
+
+    def _uv(self, arguments: Sequence[str], environ: Mapping[str, str] | None = None) -> str:
+        uv = find_uv(self.python)
+        if uv is None:
+            raise InstallationFailed(f"error: there is no uv: {install_command()}")
+        return self._run([str(uv), *arguments], environ or self.environ)
 
     def _run(self, command: Sequence[str], environ: Mapping[str, str]) -> str:
         """Run pip or uv, show what it does, and return what it wrote."""

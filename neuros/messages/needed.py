@@ -22,7 +22,7 @@ from neuros.installation.machine import system_install
 from neuros.installation.progress import Progress
 from neuros.messages import generation
 from neuros.messages.package import MANIFEST, Package
-from neuros.messages.workspace import Built, Workspaces, cycle_problem
+from neuros.messages.workspace import Built, PackageBuild, Workspaces, cycle_problem
 from neuros.project.model import Node
 
 # Packages that the generated code of services and actions needs, beside those in their files.
@@ -33,19 +33,6 @@ _IMPLIED: Mapping[str, set[str]] = {
         *("action_msgs", "builtin_interfaces", "service_msgs", "unique_identifier_msgs"),
     },
 }
-
-
-@dataclass(frozen=True)
-class PackageBuild:
-    """A package, and the folder that it is built into.
-
-    Attributes:
-        needs: builds of workspace packages that this one needs, directly or not; all come first.
-    """
-
-    package: Package
-    built: Built
-    needs: Sequence[Built]
 
 
 class Messages:
@@ -60,18 +47,10 @@ class Messages:
         self._builds: list[PackageBuild] = []
         wanted = sorted(names)
         self._problems = list(workspaces.problems if wanted else workspaces.own_problems)
-        if not wanted:
-            return
         try:
-            builds = workspaces.builds(wanted)
+            self._builds = workspaces.builds(wanted) if wanted else []
         except CycleError as error:
             self._problems.append(cycle_problem(workspaces, error))
-            return
-        by_name = {built.package: built for built in builds}
-        for built in builds:
-            needs = workspaces.closure(workspaces.needs(built.package))
-            package = workspaces.packages[built.package]
-            self._builds.append(PackageBuild(package, built, [by_name[n.name] for n in needs]))
 
     @classmethod
     def of_nodes(cls, nodes: Iterable[Node], workspaces: Workspaces) -> Messages:
@@ -277,7 +256,7 @@ class _Builder:
             self._compile()
             self._install()
             shutil.rmtree(self._source)
-            if built not in self.workspaces.builds([package.name]):
+            if built.folder != self.workspaces.installed(package.name):
                 raise EnvironmentFault(
                     f"message package '{package.name}' was changed while it was built: start again"
                 )

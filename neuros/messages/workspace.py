@@ -119,7 +119,8 @@ class Workspaces:
     def installed(self, package: str) -> Path | None:
         """The folder of the build of a package, ``None`` if it is not in a workspace."""
         try:
-            return next((b.folder for b in self.builds([package]) if b.package == package), None)
+            builds = self.builds([package])
+            return builds[-1].built.folder if builds else None
         except CycleError:
             return None
 
@@ -143,16 +144,16 @@ class Workspaces:
             )
         return found
 
-    def builds(self, names: Iterable[str]) -> list[Built]:
+    def builds(self, names: Iterable[str]) -> list[PackageBuild]:
         """Packages and all that they depend on, built or not, as :meth:`closure` orders them.
 
         The key of a package changes with its content, with that of the packages that it needs, and
         with the versions of the generators and of packages of ROS; not with that of Python.
         """
-        packages = self.closure(names)
+        builds: dict[str, PackageBuild] = {}
         tools = b"".join(self.ros.manifest(name) for name in GENERATORS)
         keys: dict[str, str] = {}
-        for package in packages:
+        for package in self.closure(names):
             digest = hashlib.sha256(_FORMAT + _ABI.read_bytes() + tools)
             digest.update(platform.machine().encode())
             for file in (Path(MANIFEST), *package.files):
@@ -165,8 +166,12 @@ class Workspaces:
             for name in sorted(package.dependencies):
                 there = keys[name].encode() if name in keys else self.ros.manifest(name)
                 digest.update(f"{name}\0{len(there)}\0".encode() + there)
-            keys[package.name] = digest.hexdigest()[:KEY_LENGTH]
-        return [Built(self._cache / f"{p.name}-{keys[p.name]}") for p in packages]
+            key = keys[package.name] = digest.hexdigest()[:KEY_LENGTH]
+            built = Built(self._cache / f"{package.name}-{key}")
+            needs = (builds[name] for name in self.needs(package.name))
+            all_needs = dict.fromkeys(each for need in needs for each in (*need.needs, need.built))
+            builds[package.name] = PackageBuild(package, built, tuple(all_needs))
+        return list(builds.values())
 
     def closure(self, names: Iterable[str]) -> list[Package]:
         """Packages and all that they depend on, each after the packages that it needs.
@@ -241,3 +246,16 @@ class Built(Kept):
         """Keep the build from being removed as unused."""
         with contextlib.suppress(OSError):
             os.utime(self.folder)
+
+
+@dataclass(frozen=True)
+class PackageBuild:
+    """A package, and the folder that it is built into.
+
+    Attributes:
+        needs: builds of workspace packages that this one needs, directly or not; all come first.
+    """
+
+    package: Package
+    built: Built
+    needs: tuple[Built, ...]

@@ -402,12 +402,3 @@ class TestCache:
 
         assert not built.draft.exists()
         assert built.is_there
-
-    def test_what_is_being_built_is_left_alone(self, bench: Bench) -> None:
-        built = self.entry(bench, "a_msgs", 0)
-        built.draft.mkdir()
-
-        with built.locked():
-            sweep(built.folder.parent)
-
-        assert built.draft.exists()
