@@ -114,7 +114,7 @@ class Registry(Generic[Part]):
         if entry is None:
             if missing := self.missing(name):
                 raise UsageError(missing)
-            known = [*self._further, *self]
+            known = [*dict.fromkeys((*self._further, *self))]
             hint = did_you_mean(name, known)
             raise UsageError(
                 f"{self.noun} '{name}': choose one of {', '.join(known)}"

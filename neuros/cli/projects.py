@@ -192,7 +192,7 @@ def add_new(new: argparse.ArgumentParser) -> None:
         metavar="FOLDER",
         help="a new or empty folder (default with --robot: the name of its file)",
     )
-    new.add_argument("--robot", type=Path, metavar="FILE", help="a robot in URDF or SDF")
+    new.add_argument("--robot", type=Path, metavar="FILE", help="a robot in URDF, SDF or MJCF")
     new.add_argument(
         "--base",
         choices=["free", "fixed"],

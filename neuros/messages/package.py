@@ -105,19 +105,24 @@ def find_packages(workspace: Path) -> tuple[list[Package], list[Problem]]:
 
 
 def misplaced(folder: Path) -> list[Path]:
-    """Interface files of a package that are in none of the folders of interfaces."""
+    """Interface files of a package that are of no use where they are, or as they are (IDL)."""
     found = []
     for place, folders, names in os.walk(folder):
         folders[:] = sorted(f for f in folders if f[0] != "." and f not in _NOT_SOURCES)
         for name in sorted(names):
             file = Path(place, name).relative_to(folder)
-            if file.suffix[1:] in KINDS and file.parent.as_posix() != file.suffix[1:]:
+            if file.suffix[1:] in (*KINDS, "idl") and file.parent.as_posix() != file.suffix[1:]:
                 found.append(file)
     return found
 
 
 def wrong_place(file: Path) -> str:
-    """The problem of an interface file that is in another folder than those of interfaces."""
+    """The problem of an interface file that is IDL, or in another folder than it should be."""
+    if file.suffix == ".idl":
+        return (
+            f"{file.name} is IDL, which NeuROS does not build: write the type as"
+            f" {file.parent.name or 'msg'}/{file.stem}.msg (.srv, .action)"
+        )
     kind, place = (
         file.suffix[1:],
         "" if file.parent == Path() else f" in the folder '{file.parent}'",

@@ -110,10 +110,11 @@ class Workspaces:
         return self.packages[package].messages if package in self.packages else None
 
     def elsewhere(self, package: str, name: str) -> str:
-        """Where a package of a workspace has a message of this name, if in a wrong folder."""
+        """Where a package of a workspace has a message of this name, if wrongly."""
         if package not in self.packages:
             return ""
-        others = (f for f in misplaced(self.packages[package].folder) if f.name == f"{name}.msg")
+        names = (f"{name}.msg", f"{name}.idl")
+        others = (f for f in misplaced(self.packages[package].folder) if f.name in names)
         return next(map(wrong_place, others), "")
 
     def installed(self, package: str) -> Path | None:

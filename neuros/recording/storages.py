@@ -12,11 +12,11 @@ import os
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from io import BytesIO
 from pathlib import Path
 from struct import Struct, unpack
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple, Protocol
 from urllib.parse import quote
 from zlib import crc32
 
@@ -35,10 +35,15 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from neuros.ordinary_files import open_ordinary
 
+if TYPE_CHECKING:
+    from rosbags.rosbag1 import Reader as Ros1Reader
+
 SQLITE_MAGIC = b"SQLite format 3\0"
+ROS_1_MAGIC = b"#ROSBAG V"
 LAST_NS = (1 << 63) - 1
 _RECORD_HEAD = Struct("<BQ")  # kind, length
 _FORMATS = {
@@ -104,8 +109,10 @@ class Storage(Protocol):
 def storage_of(path: Path) -> Storage:
     """The reader of a file, by what it begins with. Raises ``OSError``."""
     with open_ordinary(path) as file:
-        is_sqlite = file.read(len(SQLITE_MAGIC)) == SQLITE_MAGIC
-    return SqliteFile(path) if is_sqlite else McapFile(path)
+        begins = file.read(len(SQLITE_MAGIC))
+    if begins.startswith(ROS_1_MAGIC):
+        return Ros1File(path)
+    return SqliteFile(path) if begins == SQLITE_MAGIC else McapFile(path)
 
 
 _NO_DEFINITION = MessageDefinition(MessageDefinitionFormat.NONE, "")
@@ -195,6 +202,64 @@ def checkpointed(path: Path) -> None:
 def _definition(encoding: str, text: str) -> MessageDefinition:
     form = _FORMATS.get(encoding)  # a message without fields has an empty text
     return _NO_DEFINITION if form is None else MessageDefinition(form, text)
+
+
+# ---------------------------------------------------------------------- ROS 1
+
+
+class Ros1File:
+    """A bag of ROS 1, read as what ROS 2 would have recorded: a ``Header`` loses its ``seq``.
+
+    Types of ROS 2 keep its definitions; others are those of the bag, made of types of ROS 2.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._old, self._new = get_typestore(Stores.EMPTY), get_typestore(Stores.LATEST)
+
+    @contextmanager
+    def _opened(self) -> Iterator[Ros1Reader]:
+        # Imported here: few bags are of ROS 1, and every recorder would wait for it.
+        from rosbags.rosbag1 import Reader
+
+        with Reader(self._path) as bag:
+            for each in bag.connections:
+                types = get_types_from_msg(each.msgdef.data, each.msgtype)
+                self._old.register(types)
+                known = self._new.fielddefs
+                self._new.register({name: types[name] for name in types if name not in known})
+            yield bag
+
+    def contents(self, *, is_complete: bool) -> FileContents:
+        del is_complete  # rosbags needs the index at the end
+        with self._opened() as bag:
+            connections = []
+            for each in bag.connections:
+                text, _ = self._new.generate_msgdef(each.msgtype, ros_version=2)
+                definition = MessageDefinition(MessageDefinitionFormat.MSG, text)
+                about = each.id, each.topic, each.msgtype, "cdr", definition, each.msgcount
+                connections.append(connection(*about))
+            if not bag.message_count:
+                return FileContents(connections, LAST_NS, 0)
+            return FileContents(connections, bag.start_time, bag.end_time)
+
+    def messages(self, complain: Callable[[str], object], only: str | None) -> Iterator[Stored]:
+        from rosbags.convert.converter import generate_message_converter
+
+        converters: dict[str, Callable[[bytes], memoryview]] = {}
+        try:
+            with self._opened() as bag:
+                wanted = [each for each in bag.connections if only in (None, each.topic)]
+                for each, log_ns, data in bag.messages(wanted) if wanted else ():
+                    kind = each.msgtype
+                    if kind not in converters:
+                        stores = self._old, self._new, kind, kind
+                        converters[kind] = generate_message_converter(
+                            *stores, {}, src_is2=False, dst_is2=True
+                        )
+                    yield Stored(each.topic, log_ns, log_ns, bytes(converters[kind](data)))
+        except Exception as error:  # rosbags may raise anything for other bytes
+            complain(f"{self._path} is damaged ({error})")
 
 
 # ---------------------------------------------------------------------- MCAP

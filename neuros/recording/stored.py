@@ -1,4 +1,4 @@
-"""Reader of bags: of NeuROS, of every version of rosbag2, and of others; also of damaged ones.
+"""Reader of bags: of NeuROS, of every version of rosbag2, of ROS 1 and others; also damaged ones.
 
 A bag is a folder, with ``metadata.yaml`` or without, or a single file; its files are of any storage
 (:mod:`neuros.recording.storages`), compressed as a whole, by chunk or by message, or not at all.
@@ -28,6 +28,7 @@ from neuros.ordinary_files import open_ordinary
 from neuros.project.scanner import read_bytes
 from neuros.recording.storages import (
     LAST_NS,
+    ROS_1_MAGIC,
     SQLITE_MAGIC,
     Storage,
     Stored,
@@ -43,9 +44,8 @@ else:
     from backports import zstd
 
 METADATA_NAME = "metadata.yaml"
-_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
+_SUFFIXES = (".mcap", ".db3", ".bag", ".mcap.zstd", ".db3.zstd")
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_ROS_1_MAGIC = b"#ROSBAG V"
 _DISTRIBUTIONS = {1: "dashing", 2: "dashing", 3: "eloquent", 4: "foxy", 5: "humble"}
 """ROS distribution by the version of the metadata; later ones name it."""
 
@@ -96,7 +96,7 @@ class StoredBag:
 
         Raises:
             EnvironmentFault: if it cannot be read.
-            UsageError: if it is no bag of ROS 2.
+            UsageError: if it is no bag.
         """
         with damage_of(self.path):
             metadata = self._metadata()
@@ -221,15 +221,10 @@ class StoredBag:
 
 
 def _require_bag(path: Path) -> None:
-    """Raise ``UsageError`` for a file that is none of a bag of ROS 2; ``OSError``."""
+    """Raise ``UsageError`` for a file that is none of a bag; ``OSError``."""
     with open_ordinary(path) as file:
         begins = file.read(len(SQLITE_MAGIC))
-    if begins.startswith(_ROS_1_MAGIC):
-        raise UsageError(
-            f"{path} is a bag of ROS 1: `rosbags-convert --src {path} --dst FOLDER` makes one of"
-            " ROS 2"
-        )
-    known = (SQLITE_MAGIC, _ZSTD_MAGIC, MCAP0_MAGIC)
+    known = (SQLITE_MAGIC, ROS_1_MAGIC, _ZSTD_MAGIC, MCAP0_MAGIC)
     # One that was cut off may be shorter.
     if not any(begins[: len(magic)] == magic[: len(begins)] for magic in known):
         raise UsageError(f"{path} is no bag: it begins neither as MCAP nor as SQLite")

@@ -25,6 +25,7 @@ from .independent import Description, NotRead, read, tree_of
 
 _CONVERTERS = {".urdf": read_urdf, ".sdf": convert_sdf, ".world": convert_sdf}
 _STEPS = 100
+_NO_LIMIT = 1e15
 _RELATIVE, _ABSOLUTE = 1e-6, 1e-9
 _SINGLE = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _INVALID = (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQACC)
@@ -144,7 +145,7 @@ def _differences(said: Description, model: Any) -> Iterator[tuple[Sequence[str],
     for name, hinge in said.hinges.items():
         path = f"joint[[]{name.rpartition('/')[2]}]"
         if name not in joints:
-            yield [], f"there is no joint '{name}'"
+            yield [f"{path}: closes a loop*"], f"there is no joint '{name}'"
             continue
         index = joints[name]
         joint = model.joint(index)
@@ -155,10 +156,11 @@ def _differences(said: Description, model: Any) -> Iterator[tuple[Sequence[str],
         if beside > _ABSOLUTE and hinge.kind != "prismatic":
             yield [], f"'{name}' turns about another point"
         limits = tuple(joint.range) if joint.limited[0] else (-np.inf, np.inf)
-        if not np.allclose(limits, hinge.limits, rtol=_RELATIVE, atol=_ABSOLUTE):
+        clipped = np.clip([limits, hinge.limits], -_NO_LIMIT, _NO_LIMIT)
+        if not np.allclose(*clipped, rtol=_RELATIVE, atol=_ABSOLUTE):
             yield [f"{path}*: *is locked*"], f"the limits of '{name}' are {limits}"
         effort = model.jnt_actfrcrange[index, 1] if model.jnt_actfrclimited[index] else np.inf
-        if not np.isclose(effort, hinge.effort):
+        if not np.isclose(*np.minimum([effort, hinge.effort], _NO_LIMIT)):
             yield [f"{path}*: an effort of 0*"], f"the effort of '{name}' is {effort:g}"
         dof = model.jnt_dofadr[index]
         more = model.dof_damping[dof], model.dof_frictionloss[dof]

@@ -19,7 +19,6 @@ import numpy.typing as npt
 Matrix = npt.NDArray[np.float64]
 _MOMENTS = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 _SINGLE = ("revolute", "continuous", "prismatic")
-_NO_LIMIT = 1e15
 
 
 class NotRead(Exception):
@@ -48,7 +47,7 @@ class Hinge:
     """A joint with one axis; anchor and axis are in the world, shape (3,).
 
     Attributes:
-        limits: rad or m; infinite where there is none.
+        limits: rad or m; infinite, or of 1e16, where there is none.
         effort: largest force or torque; infinite where there is none.
     """
 
@@ -206,11 +205,7 @@ def _read_model(
                 rotation = (own @ place(frame))[:3, :3]
         direction = np.array(_numbers("0 0 1" if xyz is None else xyz.text or "0 0 1"))
         lower = float(axis.findtext("limit/lower", "-1e16"))
-        upper = float(axis.findtext("limit/upper", "1e16"))
-        limits = (
-            lower if lower > -_NO_LIMIT else -math.inf,
-            upper if upper < _NO_LIMIT else math.inf,
-        )
+        limits = lower, float(axis.findtext("limit/upper", "1e16"))
         if joint.attrib["type"] == "continuous":
             limits = -math.inf, math.inf
         effort = float(axis.findtext("limit/effort", "-1"))
@@ -219,7 +214,7 @@ def _read_model(
         child = prefix + joint.findtext("child", "").strip()
         result.hinges[prefix + joint.attrib["name"]] = Hinge(
             joint.attrib["type"], child, here[:3, 3], unit, limits,
-            effort if 0 <= effort < _NO_LIMIT else math.inf, *more,
+            effort if effort >= 0 else math.inf, *more,
         )  # fmt: skip
 
 

@@ -250,6 +250,22 @@ class TestMistakes:
         assert "a_msgs/msg/A.msg:1:1: found 'a_msgs/Deep', expected a message of" in problem
         assert "(found Deep.msg in the folder 'msg/more', expected it in the folder" in problem
 
+    def test_a_package_of_idl_alone_says_what_is_built(self, bench: Bench) -> None:
+        write_package(bench.own, "a_msgs", {"msg/A.idl": "module a_msgs {};\n"})
+
+        (problem,) = bench.problems()
+
+        assert "a_msgs/msg/A.idl:1:1: A.idl is IDL, which NeuROS does not build:" in problem
+        assert problem.endswith("write the type as msg/A.msg (.srv, .action)")
+
+    def test_a_field_whose_message_is_idl_says_so(self, bench: Bench) -> None:
+        files = {"msg/A.msg": "Deep d\n", "msg/Deep.idl": "module a_msgs {};\n"}
+        write_package(bench.own, "a_msgs", files)
+
+        (problem,) = bench.problems()
+
+        assert "Deep.idl is IDL, which NeuROS does not build" in problem
+
     def test_a_port_whose_message_is_in_another_folder_says_where(self, bench: Bench) -> None:
         write_package(bench.own, "a_msgs", {**POINT, "other/Deep.msg": "int32 a\n"})
 

@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 import neuros.bag
 from neuros.cli.main import main
-from neuros.errors import EnvironmentFault, UsageError
+from neuros.errors import EnvironmentFault
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 KIND = "std_msgs/msg/Float64"
@@ -232,10 +234,68 @@ class TestStorages:
             assert [*bag.topics] == ["/x", "/x (std_msgs/msg/Int8)"]
             assert bag["/x (std_msgs/msg/Int8)"].array()["data"].tolist() == [0]
 
-    def test_a_bag_of_ros_1_is_named_with_what_converts_it(self, tmp_path: Path) -> None:
+    def test_a_bag_of_ros_1_that_was_cut_off_is_damaged(self, tmp_path: Path) -> None:
         (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
-        with pytest.raises(UsageError, match="is a bag of ROS 1: `rosbags-convert --src "):
+        with pytest.raises(EnvironmentFault, match=r"old\.bag cannot be read: it is damaged"):
             neuros.bag.open(tmp_path / "old.bag")
+
+
+class TestROS1:
+    """A bag of ROS 1 is read as what ROS 2 would have recorded."""
+
+    GAUGE = "lab_msgs/msg/Gauge"
+    DEFINITION = "Header header\nfloat64[] values\ntime read_at\n"
+
+    @pytest.fixture
+    def old(self, tmp_path: Path) -> Path:
+        store = get_typestore(Stores.ROS1_NOETIC)
+        store.register(get_types_from_msg(self.DEFINITION, self.GAUGE))
+        kinds, file = store.types, tmp_path / "old.bag"
+        time = kinds["builtin_interfaces/msg/Time"]
+        header = kinds["std_msgs/msg/Header"](7, time(2, 5), "lamp")
+        with Ros1Writer(file) as writer:
+            for topic, kind, message in (
+                ("/gauge", self.GAUGE, kinds[self.GAUGE](header, np.array([1.5, 2.5]), time(3, 4))),
+                ("/temperature", "sensor_msgs/msg/Temperature",
+                 kinds["sensor_msgs/msg/Temperature"](header, 21.5, 0.1)),
+                ("/unused", "std_msgs/msg/Int8", None),
+            ):  # fmt: skip
+                added = writer.add_connection(topic, kind, typestore=store)
+                if message is not None:
+                    writer.write(added, TIMES[0], store.serialize_ros1(message, kind))
+        return file
+
+    def test_topics_types_and_values_are_there(self, old: Path) -> None:
+        with neuros.bag.open(old) as bag:
+            assert {name: topic.type for name, topic in bag.topics.items()} == {
+                "/gauge": self.GAUGE,
+                "/temperature": "sensor_msgs/msg/Temperature",
+                "/unused": "std_msgs/msg/Int8",
+            }
+            (gauge,) = bag["/gauge"]
+            assert (gauge.header.frame_id, gauge.header.stamp.sec) == ("lamp", 2)
+            assert (gauge.values.tolist(), gauge.read_at.nanosec) == ([1.5, 2.5], 4)
+            assert bag["/temperature"].array()["temperature"].tolist() == [21.5]
+            assert [*bag["/unused"]] == []
+
+    def test_it_becomes_a_bag_of_ros_2(self, old: Path, tmp_path: Path) -> None:
+        assert main(["bag", "info", str(old)]) == 0
+        assert main(["bag", "convert", str(old), "-o", str(tmp_path / "new")]) == 0
+        with AnyReader([tmp_path / "new"]) as bag:
+            for connection, time_ns, data in bag.messages():
+                assert time_ns == TIMES[0]
+                assert bag.deserialize(data, connection.msgtype).header.frame_id == "lamp"
+
+    def test_damage_of_it_is_named(self, old: Path) -> None:
+        data = bytearray(old.read_bytes())
+        at = data.index(b"lamp")
+        data[at - 4 : at] = b"\xff\xff\xff\x7f"  # the length of the text
+        old.write_bytes(data)
+        with (
+            neuros.bag.open(old) as bag,
+            pytest.raises(EnvironmentFault, match=r"old\.bag is damaged"),
+        ):
+            bag["/gauge"].raw()
 
 
 MARKER = "visualization_msgs/msg/Marker"

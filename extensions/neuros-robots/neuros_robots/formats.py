@@ -1,4 +1,4 @@
-"""SDF and URDF as models of MuJoCo's nodes."""
+"""SDF and URDF as models of MuJoCo's nodes, and robots in any format as projects."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from neuros.errors import DescriptionError, Problem
 from neuros.ports import ModelFormat, RobotChoices
-from neuros_robots.elements import Finder, NotFound, finder
-from neuros_robots.mjcf import Converted
+from neuros_robots.elements import Finder, NotFound, Report, finder, parse
+from neuros_robots.mjcf import Converted, read_mjcf
 from neuros_robots.project import make_project
 from neuros_robots.sdf import convert_sdf
 from neuros_robots.urdf import read_urdf
@@ -38,6 +39,21 @@ class _Description(ModelFormat):
         return make_project(converted, file, folder, choices)
 
 
+def _from_xml(file: Path, finder: Finder) -> Converted:
+    """A robot in MJCF, or in a description under the name of XML."""
+    root = parse(file, Report())
+    if isinstance(root, Problem):
+        raise DescriptionError([root])
+    convert = {"mujoco": read_mjcf, "robot": read_urdf, "sdf": convert_sdf}.get(root.tag)
+    if convert is None:
+        root.problem(f"a robot is <mujoco>, <robot> (URDF) or <sdf>, not <{root.tag}>")
+        root.report.raise_any()
+    assert convert is not None
+    return convert(file, finder)
+
+
+XML = _Description("xml", _from_xml)
+MJCF = _Description("mjcf", _from_xml)
 URDF = _Description("urdf", read_urdf)
 XACRO = _Description("xacro", read_urdf)
 SDF = _Description("sdf", convert_sdf)

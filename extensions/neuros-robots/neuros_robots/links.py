@@ -448,6 +448,8 @@ def _add_rays(building: Building, link: Link, element: Element, pose: Pose) -> N
         _angles(settings, way) for way in ("horizontal", "vertical")
     )
     count = columns * rows
+    if count > 1 and rows == 1:
+        _add_site(building, link, element, pose)  # where a node file may declare a lidar
     if not 1 <= count <= _MOST_RAYS:
         element.omit(f"{count} rays: MuJoCo has a sensor for each, and {_MOST_RAYS} at most")
         return

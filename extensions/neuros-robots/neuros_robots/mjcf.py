@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,6 +28,7 @@ MARK = "made by `neuros convert`"
 _READ_BY_MUJOCO = (".obj", ".stl", ".msh")
 _CONVERTED = (".dae", ".glb", ".gltf", ".ply", ".off", ".3mf")
 _CONVERTERS = ("trimesh", "collada")
+_FREE = mujoco.mjtJoint.mjJNT_FREE
 _SHELL = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
 _HOW = "`pip install 'neuros[meshes]'` converts it"
 Triangles = tuple[npt.NDArray[np.float64], npt.NDArray[np.int32]]
@@ -110,6 +111,7 @@ class Converted:
         differences: parts of the description that it lacks, or has in another form.
         made_meshes: triangles of the converted meshes, by their names.
         bodies, joints: their numbers.
+        may_move: whether the root stands in the world since the format cannot say that it moves.
     """
 
     spec: Any
@@ -117,6 +119,7 @@ class Converted:
     made_meshes: dict[str, Triangles]
     bodies: int
     joints: int
+    may_move: bool = False
 
 
 def finished(building: Building, roots: Sequence[Element]) -> Converted:
@@ -152,6 +155,44 @@ def finished(building: Building, roots: Sequence[Element]) -> Converted:
     return Converted(spec, report.differences(), made, model.nbody - 1, model.njnt)
 
 
+def read_mjcf(file: Path, finder: Finder) -> Converted:
+    """A robot in MJCF as it is; the files that it names get absolute paths.
+
+    Raises ``DescriptionError``.
+    """
+    del finder  # MuJoCo finds files itself
+    try:
+        if file.suffix.lower() == ".xml":
+            spec = mujoco.MjSpec.from_file(str(file))
+        else:  # which MuJoCo does not open
+            spec = mujoco.MjSpec.from_string(file.read_text("utf-8"))
+            spec.modelfiledir = str(file.resolve().parent)
+        model = spec.copy().compile()
+    except (ValueError, mujoco.FatalError) as error:
+        text = message_of(error)
+        line = re.search(r"\bline (\d+)", text)
+        problem = Problem(str(file), int(line[1]) if line else 1, 1, "/", text)
+        raise DescriptionError([problem]) from error
+    for things, folder in _assets(spec, spec.meshdir, spec.texturedir):
+        for thing in things:
+            if thing.file:
+                thing.file = str(file.resolve().parent / folder / thing.file)
+    spec.meshdir = spec.texturedir = ""
+    # A node file names what it reads and drives.
+    for number, body in enumerate(spec.bodies):
+        body.name = body.name or f"body{number}"
+    for joint in spec.joints:
+        if not joint.name:
+            joint.name = f"{joint.parent.name}/{'free' if joint.type == _FREE else 'joint'}"
+    return Converted(spec, (), {}, model.nbody - 1, model.njnt)
+
+
+def _assets(spec: Any, meshes: str = "", textures: str = "") -> Iterator[tuple[Any, str]]:
+    """All that a spec reads from files, each with one of two folders."""
+    yield from ((spec.meshes, meshes), (spec.hfields, meshes), (spec.skins, meshes))
+    yield spec.textures, textures
+
+
 def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
     """Write MJCF with the differences in a comment; returns all written files.
 
@@ -181,9 +222,10 @@ def write_mjcf(converted: Converted, source: Path, output: Path) -> list[Path]:
             file.write_text("\n".join(rows) + "\n", "ascii")
             written.append(file)
             mesh.uservert, mesh.userface, mesh.file = [], [], str(file)
-        mesh.file = os.path.relpath(mesh.file, folder)
-    for field_ in spec.hfields:
-        field_.file = os.path.relpath(field_.file, folder)
+    for things, _ in _assets(spec):
+        for thing in things:
+            if thing.file:
+                thing.file = os.path.relpath(thing.file, folder)
     lines = [f"{MARK} from {source.name}"]
     if converted.differences:
         lines += ["", "Not taken over, or not as it was:"]

@@ -27,7 +27,7 @@ _NARROW = 1e-3  # narrower ranges (rad or m) are those of locked joints
 _STIFFEST = 20.0  # rad/s: of a servo without a load
 _SAG = 0.05  # rad or m: how far a servo gives way to the weight, or to its largest force
 _MOST_PIXELS = 640
-_RATES_HZ = {"joints": 50, "imu": 50, "pose": 50, "camera": 10}
+_RATES_HZ = {"joints": 50, "imu": 50, "pose": 50, "lidar": 10, "camera": 10}
 
 _ROBOT = '''\
 """The robot: MuJoCo steps itself at the pace of the clock, and sends what its sensors measure."""
@@ -90,8 +90,9 @@ def make_project(
         OSError: the folder cannot be written.
     """
     spec = converted.spec.copy()
-    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # for stiff drives
-    base = _set_base(spec, source, choices.base)
+    if not spec.keys:
+        spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST  # for stiff drives
+    base = _set_base(spec, source, choices.base, may_move=converted.may_move)
     try:
         model = spec.copy().compile()
     except ValueError as error:
@@ -101,14 +102,14 @@ def make_project(
         raise DescriptionError([problem]) from error
     if not spec.lights:
         spec.worldbody.add_light(name="lamp", pos=[0, 0, 4], dir=[0.2, 0.1, -1], castshadow=True)
-    if base:
+    if base and not len(spec.worldbody.geoms):
         spec.body(base).pos[2] += _clearance_m(model)
         plane = mujoco.mjtGeom.mjGEOM_PLANE
         spec.worldbody.add_geom(
             name="floor", type=plane, size=[0, 0, 0.1], rgba=[0.5, 0.55, 0.6, 1]
         )
     drives = _add_drives(spec, model, choices.drive)
-    _copy_meshes(spec, folder)
+    _copy_files(spec, folder)
     write_mjcf(replace(converted, spec=spec), source, folder / "robot.xml")
     outputs = [*_outputs(model, drives, base)]
     _write_nodes(folder, source, outputs, drives)
@@ -118,11 +119,11 @@ def make_project(
     return lines
 
 
-def _set_base(spec: Any, source: Path, chosen: str | None) -> str:
+def _set_base(spec: Any, source: Path, chosen: str | None, *, may_move: bool) -> str:
     """Give the robot a free joint if that is chosen; returns the name of its base, or ``""``."""
     free = [joint for joint in spec.joints if joint.type == mujoco.mjtJoint.mjJNT_FREE]
     roots = list(spec.worldbody.bodies)
-    if free or source.suffix.lower() not in (".urdf", ".xacro") or len(spec.worldbody.geoms):
+    if free or not may_move or len(spec.worldbody.geoms):
         return str(free[0].parent.name) if free else ""  # the file says it
     if chosen is None and sys.stdin is not None and sys.stdin.isatty():
         answer = input(
@@ -158,7 +159,10 @@ def _add_drives(spec: Any, model: Any, chosen: str | None) -> dict[str, str]:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     followers = {equality.name1 for equality in spec.equalities if equality.name2}
-    driven = {actuator.target: "model" for actuator in spec.actuators}
+    named = {joint.name for joint in spec.joints}
+    driven = {each.target: "model" for each in spec.actuators if each.target in named}
+    if spec.keys:  # each has a control for every actuator of the file
+        return driven
     for index in range(model.njnt):
         joint = model.joint(index)
         span = float(np.ptp(joint.range)) if joint.limited[0] else math.inf
@@ -197,19 +201,23 @@ def _push(model: Any, joint: int) -> float:
     return float(model.body_subtreemass[0]) * radius**2 * _STIFFEST / 2
 
 
-def _copy_meshes(spec: Any, folder: Path) -> None:
-    """Copy the files of meshes into the project, which is then complete."""
-    target = folder / "meshes"
-    for mesh in spec.meshes:
-        if mesh.file:
+def _copy_files(spec: Any, folder: Path) -> None:
+    """Copy the files of meshes and pictures into the project, which is then complete."""
+    target, copies = folder / "meshes", dict[str, Path]()
+    for things in (spec.meshes, spec.hfields, spec.skins, spec.textures):
+        for thing in things:
+            if not thing.file:
+                continue
             target.mkdir(parents=True, exist_ok=True)
-            copied = target / f"{mesh.name}{Path(mesh.file).suffix}"
-            shutil.copyfile(mesh.file, copied)
-            mesh.file = str(copied.resolve())
+            if thing.file not in copies:
+                file = Path(thing.file)
+                copies[thing.file] = target / f"{thing.name or file.stem}{file.suffix}"
+                shutil.copyfile(file, copies[thing.file])
+            thing.file = str(copies[thing.file].resolve())
 
 
 def _outputs(model: Any, drives: dict[str, str], base: str) -> Iterable[dict[str, Any]]:
-    """Outputs for joint states, every IMU and camera, and the pose of a free base."""
+    """Outputs for joint states, every IMU, lidar and camera, and the pose of a free base."""
 
     def output(name: str, kind: str, message: str, **more: Any) -> dict[str, Any]:
         rate = _RATES_HZ["joints" if kind == "joint_states" else kind]
@@ -224,6 +232,10 @@ def _outputs(model: Any, drives: dict[str, str], base: str) -> Iterable[dict[str
     ]
     for name in gyros:
         yield output(_identifier(name), "imu", "sensor_msgs/msg/Imu", element=name)
+    yield from (
+        output(_identifier(name), "lidar", "sensor_msgs/msg/LaserScan", **more)
+        for name, more in _lidars(model)
+    )
     for index in range(model.ncam):
         name, (width, height) = model.camera(index).name, model.cam_resolution[index]
         scale = min(1.0, _MOST_PIXELS / max(width, height, 1))
@@ -232,6 +244,31 @@ def _outputs(model: Any, drives: dict[str, str], base: str) -> Iterable[dict[str
         yield output(_identifier(name), "camera", message, element=name, **size)
     if base:
         yield output("pose", "pose", "geometry_msgs/msg/PoseStamped", element=base)
+
+
+def _lidars(model: Any) -> Iterable[tuple[str, dict[str, Any]]]:
+    """The name of each plane of rangefinders with a site, and the declaration of such a lidar."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    rays: dict[str, list[int]] = {}
+    for index in np.flatnonzero(model.sensor_type == mujoco.mjtSensor.mjSENS_RANGEFINDER.value):
+        rays.setdefault(model.sensor(index).name.rpartition("/")[0], []).append(int(index))
+    sites = {model.site(index).name: index for index in range(model.nsite)}
+    for name, sensors in rays.items():
+        if name not in sites or len(sensors) < 2:
+            continue
+        axes = data.site_xmat[sites[name]].reshape(3, 3)
+        beams = data.site_xmat[model.sensor_objid[sensors]].reshape(-1, 3, 3)[:, :, 2] @ axes
+        angles = np.unwrap(np.arctan2(beams[:, 1], beams[:, 0]))
+        declared = {"element": name, "beams": len(sensors)}
+        declared |= {
+            "angle_min": round(float(angles[0]), 6),
+            "angle_max": round(float(angles[-1]), 6),
+        }
+        if most_m := float(model.sensor_cutoff[sensors[0]]):
+            declared["range_max"] = most_m
+        if angles[0] < angles[-1]:
+            yield name, declared
 
 
 def _identifier(name: str) -> str:

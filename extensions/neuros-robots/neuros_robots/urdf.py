@@ -12,6 +12,7 @@ import math
 import re
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -88,7 +89,7 @@ def read_urdf(file: Path, finder: Finder) -> Converted:
             element.is_read = True
     made = [link.element for link in robot.scope.links.values()]
     made += [branch.joint.element for branch in branches if branch.joint is not None]
-    return finished(building, [root, *made])
+    return replace(finished(building, [root, *made]), may_move=True)
 
 
 def _refuse_xacro(root: Element) -> None:

@@ -19,8 +19,10 @@ INERTIAL = '<inertial><mass value="{}"/><inertia ixx="{}" iyy="{}" izz="{}"/></i
 HEAVY, LIGHT = INERTIAL.format(5, 0.1, 0.1, 0.1), INERTIAL.format(0.2, 0.001, 0.001, 0.001)
 WHEEL = '<collision><geometry><sphere radius="0.1"/></geometry></collision>'
 SENSORS = (
-    '<sensor name="imu" type="imu"/><sensor name="eye" type="camera"><camera><image>'
-    "<width>64</width><height>48</height></image></camera></sensor>"
+    '<sensor name="scan" type="gpu_lidar"><lidar><scan><horizontal><samples>181</samples>'
+    "<min_angle>-2</min_angle><max_angle>2</max_angle></horizontal></scan><range><max>5</max>"
+    '</range></lidar></sensor><sensor name="imu" type="imu"/><sensor name="eye" type="camera">'
+    "<camera><image><width>64</width><height>48</height></image></camera></sensor>"
 )
 
 
@@ -85,6 +87,9 @@ def test_a_robot_becomes_a_project_that_is_valid(car: Path, capsys: Any) -> None
     assert sorted(drives) == ["left_joint", "neck_joint", "right_joint"]
     assert outputs["base_imu"] == {"sensor": "imu", "element": "base/imu", "rate": 50}
     assert outputs["base_eye"]["width"] == 64
+    lidar = {"sensor": "lidar", "element": "base/scan", "beams": 181, "rate": 10}
+    angles = {"angle_min": -2.0, "angle_max": 2.0, "range_max": 5.0}
+    assert outputs["base_scan"] == lidar | angles
     assert outputs["pose"]["element"] == "base"
 
 
@@ -137,6 +142,58 @@ def test_what_the_file_says_is_not_asked_for(car: Path) -> None:
     (car.parent / "ball.sdf").write_text(sdf, "utf-8")
     assert main(["new", "--robot", "ball.sdf"]) == 0
     assert declared(car.parent / "ball")[1]["pose"]["element"] == "l"
+
+
+MJCF = """\
+<mujoco model="two">
+  <compiler meshdir="parts"/>
+  <asset><mesh name="m" file="cube.obj" scale=".1 .1 .1"/></asset>
+  <worldbody>
+    <geom name="floor" type="plane" size="1 1 .1"/>
+    <body name="car" pos="0 0 1"><freejoint/><geom type="mesh" mesh="m"/><site name="imu"/>
+      <body name="arm"><joint axis="0 1 0" range="-60 60"/><geom size=".1"/></body>
+      <body><joint name="wrist" axis="0 1 0"/><geom size=".1"/></body></body>
+  </worldbody>
+  <actuator><position name="w" joint="wrist" kp="5"/></actuator>
+  <sensor><gyro name="imu/gyro" site="imu"/></sensor>{}
+</mujoco>"""
+
+
+@pytest.mark.parametrize("name", ["two.xml", "two.mjcf"])
+def test_a_robot_of_mujocos_keeps_what_it_has(car: Path, name: str, capsys: Any) -> None:
+    (car.parent / "parts").mkdir()
+    (car.parent / "cube.obj").rename(car.parent / "parts/cube.obj")
+    (car.parent / name).write_text(MJCF.format(""), "utf-8")
+    assert main(["new", "--robot", name]) == 0
+    assert "base: free (car)\n" in capsys.readouterr().out
+    (car.parent / "parts/cube.obj").unlink()
+    assert main(["validate", "two"]) == 0
+    model, outputs, nodes = declared(car.parent / "two")
+    assert nodes == ["robot", "brain"]
+    assert [model.actuator(index).name for index in range(model.nu)] == ["w", "arm/joint"]
+    assert outputs["joints"]["element"] == ["wrist", "arm/joint"]
+    assert outputs["imu"]["element"] == "imu"
+    assert model.body("car").pos[2] == 1  # it has a floor of its own
+
+    key = '<keyframe><key name="home" ctrl="0.5"/></keyframe>'
+    (car.parent / "parts/cube.obj").write_text(CUBE, "ascii")
+    (car.parent / name).write_text(MJCF.format(key), "utf-8")
+    assert main(["new", "posed", "--robot", name]) == 0
+    model, outputs, _ = declared(car.parent / "posed")
+    assert (model.nu, model.nkey, outputs["joints"]["element"]) == (1, 1, ["wrist"])
+
+
+def test_xml_that_is_no_robot_is_named(car: Path, capsys: Any) -> None:
+    for text, problem in (
+        ("<html/>", "robot.xml:1:1: html: a robot is <mujoco>, <robot> (URDF) or <sdf>"),
+        ("<mujoco>\n<bogus/></mujoco>", "robot.xml:2:1: /: XML Error: Schema violation"),
+    ):
+        (car.parent / "robot.xml").write_text(text, "utf-8")
+        assert main(["new", "--robot", "robot.xml"]) == 3
+        assert problem in capsys.readouterr().err
+    (car.parent / "robot.xml").write_text(ROBOT, "utf-8")
+    assert main(["new", "--robot", "robot.xml"]) == 2
+    assert "does not say whether 'base' moves" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
