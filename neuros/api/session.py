@@ -41,10 +41,10 @@ from neuros.control import AtRest, NodeStatus
 from neuros.errors import NeurosError, RunError, UsageError
 from neuros.node.instruments import room_for
 from neuros.ports import Changes
-from neuros.project.graph import graph_svg
 from neuros.project.model import Node, Port, Project
 from neuros.project.repeatable import why_not_repeatable
 from neuros.project.suggest import did_you_mean, listed
+from neuros.registry import BAG_FORMATS
 from neuros.transport.messages import RosPackets, checked
 
 _READ_S = 1.0
@@ -542,7 +542,7 @@ class Session:
         return f"<Session of {self._project.name}: {state}; {self.folder}>"
 
     def _repr_html_(self) -> str:
-        """For notebooks: the graph, and how often hooks have run."""
+        """For notebooks: the graph, if an extension draws it, and how often hooks have run."""
         if self._run is not None:
             return f"<pre>{html.escape(run_table(self._run.record))}</pre>"
         rows = "".join(
@@ -553,7 +553,8 @@ class Session:
         )
         head = "<tr><th>node</th><th>hook</th><th>executions</th></tr>"
         caption = html.escape(repr(self))
-        return f"{graph_svg(self._project)}<p>{caption}</p><table>{head}{rows}</table>"
+        graph = BAG_FORMATS.load("svg")(self._project) if "svg" in BAG_FORMATS else ""
+        return f"{graph}<p>{caption}</p><table>{head}{rows}</table>"
 
     # ------------------------------------------------------------------ inside
 
