@@ -30,6 +30,7 @@ def hold(what: str, found: float, ceiling: float) -> None:
 def test_lines_of_the_core() -> None:
 <<<<<<< HEAD
 <<<<<<< HEAD
+<<<<<<< HEAD
     hold("lines of neuros/", lines(NEUROS), 55_720)
 
 
@@ -42,6 +43,13 @@ def test_lines_of_the_core_and_its_extensions() -> None:
 def test_lines_of_the_core_and_its_extensions() -> None:
     hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_320)
 >>>>>>> refs/h/uv
+=======
+    hold("lines of neuros/", lines(NEUROS), 53_220)
+
+
+def test_lines_of_the_core_and_its_extensions() -> None:
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_310)
+>>>>>>> refs/h/path
 
 
 def test_lines_of_tests_and_benchmarks() -> None:

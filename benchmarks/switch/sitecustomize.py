@@ -47,9 +47,8 @@ def nothing(*_: Any) -> None:
 
 def without_ledger() -> dict[Place, Any]:
     """Times of packets, digests, the accounts of wall time, the timeline."""
+    from neuros.engine.connection_ends import SendWindow, Subscription
     from neuros.engine.engine import Engine
-    from neuros.engine.input_queue import Subscription
-    from neuros.engine.send_window import SendWindow
     from neuros.node.simulated_time import SimulatedTime
     from neuros.transport import digests
     from neuros.transport.memory import MemoryTransport

@@ -15,12 +15,11 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
+from neuros.engine.connection_ends import SendWindow, Subscription
 from neuros.engine.hook import Hook, Source
-from neuros.engine.input_queue import Subscription
 from neuros.engine.metrics import IDLE, PAUSED, REGISTERING, SCHEDULING, Rest, State
 from neuros.engine.node_ports import Links, NodePorts, PacketType
 from neuros.engine.schedule import FIRST_TURN, ExecutionLog, Lifecycle, Pause, Schedule
-from neuros.engine.send_window import SendWindow
 from neuros.engine.sim_clock import ClockSubscription
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from neuros.engine.input_queue import HookInput
+from neuros.engine.connection_ends import HookInput, SendWindow
 from neuros.engine.metrics import TickIntervals
 from neuros.engine.node_ports import Output
-from neuros.engine.send_window import SendWindow
 from neuros.errors import HookError, WrongValue
 from neuros.hooks import HookKind, HookSpec, OutputSpec
 from neuros.project.suggest import counted

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
-from neuros.engine.input_queue import HookInput, Subscription
-from neuros.engine.send_window import SendWindow
+from neuros.engine.connection_ends import HookInput, SendWindow, Subscription
 from neuros.engine.sim_clock import ClockSubscription, SimClock, TickInput
 from neuros.errors import HookError
 from neuros.hooks import HookSpec

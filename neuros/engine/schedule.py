@@ -17,9 +17,9 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
+from neuros.engine.connection_ends import SendWindow
 from neuros.engine.hook import Hook, Source
 from neuros.engine.metrics import IDLE, PAUSED, SCHEDULING, Rest
-from neuros.engine.send_window import SendWindow
 from neuros.hooks import HookKind
 from neuros.project.model import Connection
 

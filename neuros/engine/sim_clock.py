@@ -16,7 +16,7 @@ from fractions import Fraction
 from functools import wraps
 from typing import Any
 
-from neuros.engine.input_queue import HookInput, InputQueue, Subscription
+from neuros.engine.connection_ends import HookInput, InputQueue, Subscription
 from neuros.errors import HookError
 from neuros.hooks import HookKind, HookSpec, InputSpec
 from neuros.project.model import Node

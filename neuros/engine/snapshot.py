@@ -11,11 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
+from neuros.engine.connection_ends import HookInput, SendWindow, Subscription
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook, Source
-from neuros.engine.input_queue import HookInput, Subscription
 from neuros.engine.metrics import IDLE, Rest, State
-from neuros.engine.send_window import SendWindow
 from neuros.hooks import HookKind
 
 _T = TypeVar("_T")

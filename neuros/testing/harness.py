@@ -19,8 +19,8 @@ from typing import Any
 from neuros.backends.node_command import without_mark
 from neuros.control import Message, Shutdown
 from neuros.distribution import WORKSPACE
+from neuros.engine.connection_ends import SendWindow
 from neuros.engine.engine import Engine
-from neuros.engine.send_window import SendWindow
 from neuros.engine.snapshot import explain, snapshot
 from neuros.errors import NeurosError, NodeError, ProjectError
 from neuros.installation.progress import Progress

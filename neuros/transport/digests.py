@@ -18,8 +18,13 @@ from xxhash import xxh3_64, xxh3_64_intdigest
 
 from neuros.project.model import Connection
 from neuros.transport.codecs import message_codec
-from neuros.transport.large_packets import LARGE_BYTES, is_parcel, message_of
-from neuros.transport.message_buffers import Buffers, message_buffers
+from neuros.transport.large_packets import (
+    LARGE_BYTES,
+    Buffers,
+    is_parcel,
+    message_buffers,
+    message_of,
+)
 from neuros.transport.messages import kind_of
 
 Digest: TypeAlias = Callable[[bytes, Any], int]

@@ -29,9 +29,8 @@ from rclpy.subscription import Subscription
 from neuros.errors import NO_WAITING, NodeError
 from neuros.project.model import NodeFile, Value
 from neuros.project.names import Names
-from neuros.transport.executors import EXECUTOR_VARIABLE
 from neuros.transport.rclpy_patches import end_discovery
-from neuros.transport.ros_loop import RosLoop
+from neuros.transport.ros_loop import EXECUTOR_VARIABLE, RosLoop
 
 _NO_NAMES = Names()
 _NOTHING: Mapping[str, Value] = types.MappingProxyType({})

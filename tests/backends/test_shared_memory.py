@@ -23,7 +23,7 @@ from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
 from neuros.backends.shared_memory import hold, remove_dead_runs, sweep
 from neuros.transport.dds_profile import PROFILES_VARIABLE, RANGE_VARIABLE
-from neuros.transport.message_buffers import SegmentWriter
+from neuros.transport.large_packets import SegmentWriter
 
 SHM = Path("/dev/shm")
 PORT = ("fastrtps_port7411", "fastrtps_port7411_el", "sem.fastrtps_port7411_mutex")

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from benchmarks import in_turn
+from neuros.engine.connection_ends import SendWindow
 from neuros.engine.engine import Engine
 from neuros.engine.event_log import LoggedEngine
-from neuros.engine.send_window import SendWindow
 from neuros.node.instruments import NodeRecorder
 from neuros.project.model import Connection
 

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from engine_bench import Bench, Clock, function, initialise, wire
 
+from neuros.engine.connection_ends import SendWindow
 from neuros.engine.engine import Engine
-from neuros.engine.send_window import SendWindow
 from neuros.errors import ProtocolError
 from neuros.hooks import All, Optional
 from neuros.project.model import Node, Port

@@ -51,8 +51,7 @@ from neuros.project.model import Folders
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
 from neuros.recording.recorder import Recorder
 from neuros.transport.codecs import WrongBytes, message_codec
-from neuros.transport.large_packets import LargeInput, LargeOutput
-from neuros.transport.message_buffers import message_buffers
+from neuros.transport.large_packets import LargeInput, LargeOutput, message_buffers
 from neuros.transport.ros import data_qos, position_of
 from neuros.transport.ros_graph import qos_profile
 from tests.support.message_packages import MANIFEST

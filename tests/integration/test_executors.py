@@ -23,11 +23,10 @@ from std_msgs.msg import Int32
 from neuros.backends.domain import choose_domain
 from neuros.errors import EnvironmentFault
 from neuros.transport import ros_loop
-from neuros.transport.executors import EXECUTOR_VARIABLE, WaitSetExecutor, make_executor
 from neuros.transport.lean_node import LeanNode, PluginCallbacks
 from neuros.transport.messages import message_class
 from neuros.transport.rclpy_patches import Turn
-from neuros.transport.ros_loop import RosLoop
+from neuros.transport.ros_loop import EXECUTOR_VARIABLE, RosLoop, WaitSetExecutor, make_executor
 
 EVENTS = "rclpy.experimental.events_executor"
 TIMEOUT_S = 20.0

@@ -17,7 +17,7 @@ import pytest
 from launching import Finished, launch
 
 from containers import require_containers
-from neuros.transport.executors import EXECUTOR_VARIABLE
+from neuros.transport.ros_loop import EXECUTOR_VARIABLE
 
 PROJECT = Path(__file__).parent / "overload"
 DURATION_S = 6

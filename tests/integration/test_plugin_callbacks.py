@@ -22,10 +22,9 @@ from std_srvs.srv import Trigger
 from neuros.backends.domain import choose_domain
 from neuros.errors import NodeError
 from neuros.node.failures import callback_error
-from neuros.transport.executors import EXECUTOR_VARIABLE
 from neuros.transport.lean_node import LeanNode, PluginCallbacks, give_up
 from neuros.transport.messages import message_class
-from neuros.transport.ros_loop import RosLoop
+from neuros.transport.ros_loop import EXECUTOR_VARIABLE, RosLoop
 
 LIMIT_S = 20.0
 

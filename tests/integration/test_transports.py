@@ -14,7 +14,7 @@ from neuros.backends.domain import choose_domain
 from neuros.ports import Transport, TransportKind
 from neuros.project.model import NodeFile
 from neuros.runtime.one_process import LOCAL, MEMORY
-from neuros.transport.executors import EXECUTOR_VARIABLE
+from neuros.transport.ros_loop import EXECUTOR_VARIABLE
 from neuros.transport.ros_process import ROS
 
 SLICE_S = 0.002

@@ -9,11 +9,10 @@ from typing import Any
 from unittest.mock import patch
 
 import neuros.launcher.quiescence as quiescence
+from neuros.engine.connection_ends import InputQueue, SendWindow, Subscription
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
-from neuros.engine.input_queue import InputQueue, Subscription
 from neuros.engine.schedule import FIRST_TURN, Lifecycle, Schedule
-from neuros.engine.send_window import SendWindow
 from neuros.project.model import Connection
 
 

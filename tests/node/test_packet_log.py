@@ -11,11 +11,10 @@ from typing import Any
 import pytest
 
 from neuros.api.packets import read_packets
+from neuros.engine.connection_ends import SendWindow, Subscription
 from neuros.engine.event_log import LoggedEngine
 from neuros.engine.hook import Hook
-from neuros.engine.input_queue import Subscription
 from neuros.engine.schedule import ExecutionLog
-from neuros.engine.send_window import SendWindow
 from neuros.hooks import HookKind, HookSpec
 from neuros.node.logs import PacketLog
 from neuros.project.model import Connection

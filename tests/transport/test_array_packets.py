@@ -20,8 +20,13 @@ from neuros.project.message_types import ArrayType, array_type, normalised, wron
 from neuros.project.model import Port
 from neuros.transport.codecs import WrongBytes, message_codec
 from neuros.transport.digests import digest_for, digest_of
-from neuros.transport.large_packets import LARGE_BYTES, LargeInput, LargeOutput, is_parcel
-from neuros.transport.message_buffers import message_buffers
+from neuros.transport.large_packets import (
+    LARGE_BYTES,
+    LargeInput,
+    LargeOutput,
+    is_parcel,
+    message_buffers,
+)
 from neuros.transport.messages import (
     RosPackets,
     checked,

@@ -12,8 +12,7 @@ from std_msgs.msg import String
 
 from neuros.transport.codecs import message_codec
 from neuros.transport.digests import TriedDigest, digest_for, digest_of
-from neuros.transport.large_packets import LargeInput, LargeOutput, is_parcel
-from neuros.transport.message_buffers import message_buffers
+from neuros.transport.large_packets import LargeInput, LargeOutput, is_parcel, message_buffers
 
 LARGE = 100_000
 

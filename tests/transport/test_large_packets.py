@@ -18,9 +18,9 @@ from neuros.transport.large_packets import (
     LargeInput,
     LargeOutput,
     machine_token,
+    message_buffers,
     slots_for,
 )
-from neuros.transport.message_buffers import message_buffers
 from neuros.transport.messages import message_class
 
 BUFFERS = message_buffers(message_class("sensor_msgs/msg/Image"))

@@ -15,7 +15,7 @@ from sensor_msgs.msg import Image, Imu, JointState, LaserScan, PointCloud2
 from std_msgs.msg import ByteMultiArray, Float64MultiArray, String
 from stereo_msgs.msg import DisparityImage
 
-from neuros.transport.message_buffers import SegmentReader, SegmentWriter, message_buffers
+from neuros.transport.large_packets import SegmentReader, SegmentWriter, message_buffers
 from neuros.transport.messages import message_class
 
 message_class("sensor_msgs/msg/Image")  # loads what ROS needs for its first message

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neuros.transport.message_buffers import Overwritten, SegmentReader, SegmentWriter
+from neuros.transport.large_packets import Overwritten, SegmentReader, SegmentWriter
 
 TYPES = "B", "d"
 
