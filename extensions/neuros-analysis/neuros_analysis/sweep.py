@@ -27,13 +27,13 @@ from neuros.api.plan import time_problems
 from neuros.api.project import Project
 from neuros.api.request import Request
 from neuros.api.run import Run
-from neuros.api.run_record import consumed_percent
 from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
 from neuros.options import takes
 from neuros.ports import Job, JobResources, Jobs, SweepExecutor, SweepPlan
 from neuros.recording.run_file import RUN_FILE, read_object
 from neuros.registry import AUTO, BACK_ENDS, EXECUTORS
+from neuros_analysis.comparison import consumed_percent
 from neuros_analysis.options import SweepOptions
 
 _PLAN_NAME = "sweep.json"
@@ -69,9 +69,9 @@ class Sweep:
 
     def frame(self) -> Any:
         """A ``pandas.DataFrame``, one row per run."""
-        from neuros_analysis.frames import table
+        import pandas as pd
 
-        return table(self.rows)
+        return pd.DataFrame(self.rows)
 
     def runs(self) -> list[Run]:
         """The runs that have begun, in the order of the rows."""
