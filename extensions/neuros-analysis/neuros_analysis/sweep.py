@@ -24,7 +24,7 @@ from tabulate import tabulate
 from neuros.api.live import LiveRun
 from neuros.api.loading import override_texts, value_text
 from neuros.api.plan import time_problems
-from neuros.api.project import Project
+from neuros.api.project import Project, StartOptions
 from neuros.api.request import Request
 from neuros.api.run import Run
 from neuros.caching import locked
@@ -282,7 +282,7 @@ def _check_all(project: Project, points: Sequence[Point], request: Request) -> J
     needs: set[JobResources] = set()
     for point in points:
         try:
-            checked = project.check_with(point.settings, point.seed)
+            checked = project.described(StartOptions(set=point.settings, seed=point.seed))
             problems += time_problems(checked, checked.nodes, request.end)
             needs.add(JobResources.of(checked))
         except ProjectError as error:
