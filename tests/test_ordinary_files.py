@@ -17,9 +17,7 @@ from neuros.ordinary_files import (
     write_whole,
 )
 from neuros.recording.recorder import counts_of
-from neuros.recording.recording_plan import Topic
 from neuros.recording.run_file import write_run_file
-from neuros.recording.spool import ListenedSpool
 
 
 @pytest.fixture
@@ -100,14 +98,6 @@ def test_a_node_cannot_have_the_record_written_elsewhere(run: Path, victim: Path
     write_run_file({"reason": "done"}, run)
     assert victim.read_text() == "mine"
     assert "done" in (run / "run.json").read_text()
-
-
-def test_a_node_cannot_have_the_list_of_topics_written_elsewhere(run: Path, victim: Path) -> None:
-    (run / ".listener").mkdir()
-    for name in ("topics.json", ".topics.json", "topics.json.new"):
-        (run / ".listener" / name).symlink_to(victim)
-    ListenedSpool(run).add(Topic("/x", "std_msgs/msg/String"))
-    assert victim.read_text() == "mine"
 
 
 def test_no_recorder_waits_for_a_pipe_that_a_node_has_left(run: Path) -> None:

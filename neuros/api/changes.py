@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from neuros.api.loading import with_model_fields
@@ -13,30 +12,10 @@ from neuros.project.model import Project
 from neuros.project.suggest import did_you_mean
 
 _KINDS = (["environment"], ["parameters"])
-_WHAT = (
+CHANGES_IN_WORDS = (
     "a fork changes nodes.NODE.environment.VARIABLE, nodes.NODE.parameters.NAME and"
     " NODE.model.FIELD, each to a value"
 )
-
-
-def settings_of(texts: Sequence[str]) -> dict[str, Any]:
-    """The values of ``--set PATH=VALUE``.
-
-    Raises:
-        UsageError: for a text without a path or value.
-    """
-    found: dict[str, Any] = {}
-    for text in texts:
-        path, _, value = text.partition("=")
-        if not (path and value):
-            raise UsageError(f"--set {text}: write PATH=VALUE; {_WHAT}")
-        found[path] = value
-        if path.split(".")[2:3] != ["environment"]:
-            try:
-                found[path] = json.loads(value)
-            except ValueError:
-                continue
-    return found
 
 
 def changes_of(
@@ -64,7 +43,7 @@ def changes_of(
     }
     wrong = [path for path in settings if path not in possible]
     if wrong:
-        raise UsageError(f"set: {', '.join(wrong)}: {_WHAT}")
+        raise UsageError(f"set: {', '.join(wrong)}: {CHANGES_IN_WORDS}")
     if not settings:
         return {}
     changed, found = load(settings), {}

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
-from neuros.api.observation import Observation, check_observation
+from neuros.api.observation import Observation
 from neuros.api.plan import Plan
 from neuros.api.run_folder import (
     LAUNCHER_LOG,
@@ -68,7 +68,7 @@ class Execution:
 
     Raises:
         UsageError: if the run folder, the domain or the recording is impossible.
-        EnvironmentFault: if no domain is free, or the load monitor is not installed.
+        EnvironmentFault: if no domain is free.
     """
 
     def __init__(
@@ -88,7 +88,6 @@ class Execution:
         self._run_id = os.urandom(8).hex()
         with contextlib.ExitStack() as stack:
             stack.callback(plan.deployment.finish, lambda: True)
-            check_observation(monitors_load=plan.request.monitor_system_load)
             self._recording_plan = recording_of(plan, os.environ)
             listened = self._recording_plan.listen if self._recording_plan else ()
             if plan.request.isolate and plan.back_end.has_own_network and listened:

@@ -1,16 +1,19 @@
-"""System load and provenance of a run, for its record."""
+"""System load and provenance of a run, for its record; statuses of its nodes while it goes on."""
 
 from __future__ import annotations
 
 import os
+import select
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.run_processes import RUN_ID
-from neuros.errors import EnvironmentFault
+from neuros.control import GetStatus, NodeStatus, Watch
+from neuros.control.link import ControlLink
 
 if TYPE_CHECKING:
     from neuros.api.plan import Plan
@@ -18,14 +21,6 @@ if TYPE_CHECKING:
 
 HOST = "host"
 """The columns of all nodes together, where they share a process."""
-
-
-def check_observation(*, monitors_load: bool) -> None:
-    """Raise ``EnvironmentFault`` if the load is to be monitored, and psutil is not installed."""
-    if monitors_load and find_spec("psutil") is None:
-        raise EnvironmentFault(
-            "--monitor-system-load needs the package psutil, which is missing: pip install psutil"
-        )
 
 
 class Observation:
@@ -94,3 +89,27 @@ def owner_of_processes(
         return name if name in names else None
 
     return owner
+
+
+def statuses(
+    link: ControlLink, wanted: Callable[[], Mapping[str, Any]], period_s: float
+) -> Iterator[NodeStatus]:
+    """Statuses of all nodes, one each period, until the run is over.
+
+    Args:
+        link: to the supervisor; closed at the end.
+        wanted: the samples to ask for next, by node.
+    """
+    with closing(link):
+        link.send(Watch())
+        next_s = time.monotonic()
+        while True:
+            if time.monotonic() >= next_s:
+                next_s = time.monotonic() + period_s
+                link.send(GetStatus(wanted()))
+            if not select.select([link], [], [], max(0.0, next_s - time.monotonic()))[0]:
+                continue
+            messages = link.receive()
+            if messages is None:
+                return
+            yield from (each for each in messages if isinstance(each, NodeStatus))

@@ -98,25 +98,22 @@ def named_peers(peers: str) -> list[str]:
     Raises:
         UsageError: if one is neither an IPv4 address nor the name of a host.
     """
-    wanted = [part.strip() for part in peers.split(",")]
-    nonsense = [part for part in wanted if not _is_possible(part)]
+    wanted, nonsense = [part.strip() for part in peers.split(",")], []
+    for part in wanted:
+        is_possible = bool(_HOST_NAME.fullmatch(part))
+        if _LOOKS_LIKE_AN_ADDRESS.fullmatch(part):
+            try:
+                address = ipaddress.IPv4Address(part)
+                is_possible = not (address.is_unspecified or address.is_multicast)
+            except ValueError:
+                is_possible = False
+        nonsense += [] if is_possible else [repr(part)]
     if nonsense:
         raise UsageError(
-            f"--peers {peers}: {', '.join(map(repr, nonsense))} is neither an IPv4 address nor the"
-            " name of a host: give them as in --peers 10.0.0.7,robot.local"
+            f"--peers {peers}: {', '.join(nonsense)} is neither an IPv4 address nor the name of a"
+            " host: give them as in --peers 10.0.0.7,robot.local"
         )
     return wanted
-
-
-def _is_possible(text: str) -> bool:
-    """Whether a text is an address of a machine, or the name of a host."""
-    if _LOOKS_LIKE_AN_ADDRESS.fullmatch(text):
-        try:
-            address = ipaddress.IPv4Address(text)
-        except ValueError:
-            return False
-        return not (address.is_unspecified or address.is_multicast)
-    return _HOST_NAME.fullmatch(text) is not None
 
 
 @dataclass(frozen=True)
@@ -290,25 +287,21 @@ def make_plan(
         nodes = [node for node in nodes if node.name not in chosen.deployment.places]
         network = Network(bool(chosen.deployment.places))
     back_end = chosen.back_end
-    if back_end.is_one_process:
-        _check_reach(project, names, back_end)
     has_pythons = not (back_end.is_one_process or back_end.has_own_pythons)
     pythons = Pythons.choose(nodes if has_pythons else [], project.folder, os.environ)
     plan = Plan(project, names, chosen, request, pythons, network, messages, restored=restored)
-    if back_end.is_one_process and network.is_wide and plan.is_partial:
-        raise UsageError(
-            f"--network with -n: the nodes of the {back_end.name} back end cannot reach nodes"
-            " elsewhere; use --backend process"
-        )
-    if request.isolate:
-        _check_isolation(plan)
-    _check_time(plan)
+    _check_places(plan)
     conflicts = nest_conflicts(project, names) if back_end.is_one_process else ()
     if problems := [*conflicts, *time_problems(project, plan.nodes, request.end)]:
         raise ProjectError(problems)
     if is_tried:
         check_machine(plan, os.environ)
-        peers = (*network.peers, *plan.deployment.connect(_print_notice))
+
+        def show(severity: str, text: str) -> None:  # there is no console yet
+            mark = "" if severity == "INFO" else "warning: "
+            print(f"neuros: {mark}{printable(text)}", file=sys.stderr, flush=True)
+
+        peers = (*network.peers, *plan.deployment.connect(show))
         plan = replace(plan, network=replace(network, peers=peers))
     return plan
 
@@ -335,12 +328,6 @@ def _choose_machines(project: Project, file: Path, request: Request) -> Chosen:
         monitors_load=request.monitor_system_load,
     )
     return Chosen(BACK_ENDS.load(_ON_MACHINES), deployment)
-
-
-def _print_notice(severity: str, text: str) -> None:
-    """Print news from other machines, before there is a console."""
-    mark = "" if severity == "INFO" else "warning: "
-    print(f"neuros: {mark}{printable(text)}", file=sys.stderr, flush=True)
 
 
 def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
@@ -384,52 +371,43 @@ def _cores_in_words(cores: Collection[int]) -> str:
     return f"core{'s' if len(cores) > 1 else ''} {', '.join(map(str, sorted(cores)))}"
 
 
-def _check_reach(project: Project, chosen: Collection[str], back_end: BackEnd) -> None:
-    """Refuse a connection to a node elsewhere: these nodes pass packets in memory."""
-    for connection in project.connections:
-        ends = {connection.source_node, connection.destination_node}
-        if len(ends) == 2 and len(ends.intersection(chosen)) == 1:
+def _check_places(plan: Plan) -> None:
+    """Refuse nodes elsewhere that this run cannot reach: by memory, isolated, in virtual time."""
+    back_end, request, nodes = plan.back_end, plan.request, plan.project.nodes
+    elsewhere = "--network" if plan.network.is_wide else "-n" if plan.is_partial else ""
+    if back_end.is_one_process:
+        for connection in plan.project.connections:
+            ends = {connection.source_node, connection.destination_node}
+            if len(ends) == 2 and len(ends.intersection(plan.names)) == 1:
+                raise UsageError(
+                    f"-n leaves out one end of {connection}, which the {back_end.name} back end"
+                    " cannot reach; use --backend docker or process"
+                )
+        if plan.network.is_wide and plan.is_partial:
             raise UsageError(
-                f"-n leaves out one end of {connection}, which the {back_end.name} back end"
-                " cannot reach; use --backend docker or process"
+                f"--network with -n: the nodes of the {back_end.name} back end cannot reach nodes"
+                " elsewhere; use --backend process"
             )
-
-
-def _check_time(plan: Plan) -> None:
-    """Refuse virtual time where nodes would run in real time, and a pace of real time."""
-    request = plan.request
-    if not plan.project.is_virtual:
-        if request.real_time_factor is not None:
-            raise UsageError(
-                "--real-time-factor: it is the pace of virtual time: add --time virtual; the"
-                " machine sets that of real time"
-            )
-        return
-    others = {"-n": plan.is_partial, "--network": plan.network.is_wide}
-    for option, is_given in others.items():
-        if is_given:
-            raise UsageError(
-                f"{option}: nodes elsewhere are in real time: leave out --time virtual"
-            )
-
-
-def _check_isolation(plan: Plan) -> None:
-    """Refuse what a run in a network of its own cannot reach."""
-    if plan.network.is_wide or plan.is_partial:
-        option = "--network" if plan.network.is_wide else "-n"
-        raise UsageError(f"--isolate with {option}: nodes elsewhere cannot reach the run")
-    nodes = plan.project.nodes
-    sent = {port.external_topic for node in nodes for port in node.outputs}
+    if request.isolate and elsewhere:
+        raise UsageError(f"--isolate with {elsewhere}: nodes elsewhere cannot reach the run")
+    sent = {None, *(port.external_topic for node in nodes for port in node.outputs)}
     unreachable = [
         f"{node.name}.{port.name} ({port.external_topic})"
         for node in nodes
         for port in node.inputs
-        if port.external_topic not in sent | {None}
+        if port.external_topic not in sent
     ]
-    if unreachable:
+    if request.isolate and unreachable:
         raise UsageError(
             f"--isolate: other programs cannot reach the external inputs"
             f" {', '.join(unreachable)}; leave --isolate out, or connect them"
+        )
+    if plan.project.is_virtual and elsewhere:
+        raise UsageError(f"{elsewhere}: nodes elsewhere are in real time: leave out --time virtual")
+    if request.real_time_factor is not None and not plan.project.is_virtual:
+        raise UsageError(
+            "--real-time-factor: it is the pace of virtual time: add --time virtual; the machine"
+            " sets that of real time"
         )
 
 

@@ -72,7 +72,13 @@ class PluginText:
             lines = "\n".join(f"node '{node}': {text}" for text in self._problems)
             raise UsageError(f"{lines}\n{_ADVICE}")
         head = '"""Plugin that NeuROS has written from functions of a program."""'
-        parts = ["\n".join(self._statements()), "\n".join(self._constants), *self._definitions]
+        statements = []
+        for module, names in sorted(self._imports.items()):
+            whole = [name for name in names if name == "" or name.startswith("as ")]
+            statements += [f"import {module} {name}".rstrip() for name in whole]
+            if listed := sorted(names.keys() - {*whole}):
+                statements.append(f"from {module} import {', '.join(listed)}")
+        parts = ["\n".join(statements), "\n".join(self._constants), *self._definitions]
         self.text = "\n\n".join([head, *filter(None, parts)]) + "\n"
 
     def write(self, file: Path) -> None:
@@ -163,16 +169,6 @@ class PluginText:
             hint = ", which changes" if isinstance(value, list | dict | set) else ""
             kind = f"{type(value).__name__}{hint}"
             self._refuse(user, f"it uses '{name}' ({kind}): make it in an initialise hook")
-
-    def _statements(self) -> Iterator[str]:
-        """The import statements."""
-        for module, names in sorted(self._imports.items()):
-            for name in names:
-                if name == "" or name.startswith("as "):
-                    yield f"import {module} {name}".rstrip()
-            listed = sorted(name for name in names if name and not name.startswith("as "))
-            if listed:
-                yield f"from {module} import {', '.join(listed)}"
 
     def _import(self, module: ModuleType, name: str) -> None:
         """Import a module (``""`` or ``"as np"``), or a name of it."""

@@ -209,10 +209,8 @@ class Project:
         project._warned -= project._loaded.unconnected
         return project
 
-    def check_with(
-        self, settings: Mapping[str, Any], seed: int | None = None, *, is_held: bool = False
-    ) -> Described:
-        """Check the project as a run with these values does; returns its model.
+    def described(self, options: StartOptions | None = None, *, is_held: bool = False) -> Described:
+        """The model of the project, checked as a run with these options does it.
 
         Args:
             is_held: whether it is for a session, which may use ports without a connection.
@@ -221,11 +219,7 @@ class Project:
             ProjectError: with all problems.
             UsageError: if there is a seed, and no node has a variable for it.
         """
-        return self._load_for_run(StartOptions(set=settings, seed=seed), is_held=is_held)[0]
-
-    def described(self, options: StartOptions) -> Described:
-        """The model of the project, checked as a run with these options does it."""
-        return self._load_for_run(options)[0]
+        return self._load_for_run(options or StartOptions(), is_held=is_held)[0]
 
     def text(self) -> str:
         """The whole project as JSON, node files merged in."""

@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from neuros.bag import Bag
 
 
-_LATENCIES = ("p50", "p90", "p99", "max")
-_SUMMED = ("executing", "waiting", "blocked")
-
-
 class Run(PastRun):
     """Result of a run: its end, its figures, its packets, its logs.
 
@@ -99,13 +95,11 @@ class Run(PastRun):
 
     def connection_frame(self) -> Any:
         """A ``pandas.DataFrame`` with a row for each connection; made by an extension."""
-        rows = map(connection_figures, self.record["connections"])
-        return BAG_FORMATS.load("table")(rows, "connection")
+        return BAG_FORMATS.load("connections")(self)
 
     def node_frame(self) -> Any:
         """A ``pandas.DataFrame`` of seconds by cause, a row for each node; made by an extension."""
-        rows = (node_figures(name, node) for name, node in self.nodes.items())
-        return BAG_FORMATS.load("table")(rows, "node")
+        return BAG_FORMATS.load("nodes")(self)
 
     @cached_property
     def bag(self) -> Bag:
@@ -159,23 +153,6 @@ class Run(PastRun):
     def _repr_html_(self) -> str:
         """For notebooks."""
         return f"<pre>{html.escape(str(self))}</pre>"
-
-
-def connection_figures(connection: Mapping[str, Any]) -> dict[str, Any]:
-    """A connection in one row: its figures with those of its latency, without digests."""
-    latency = connection.get("latency_ms") or {}
-    plain = {k: v for k, v in connection.items() if k not in ("latency_ms", "digests", "index")}
-    return plain | {f"latency_{name}_ms": latency.get(name) for name in _LATENCIES}
-
-
-def node_figures(name: str, node: Mapping[str, Any]) -> dict[str, Any]:
-    """A node in one row: seconds by cause, executions, simulated time, results."""
-    spent = node.get("accounting") or {}
-    sums = {f"{kind}_s": sum(spent[kind].values()) for kind in _SUMMED if kind in spent}
-    idle = {"idle_s": spent["idle"], "total_s": spent["total"]} if spent else {}
-    hooks = node.get("hooks") or {}
-    executions = sum(hook["executions"] for hook in hooks.values())
-    return {"node": name, **sums, **idle, "executions": executions, **node.get("results", {})}
 
 
 def _number(value: Any) -> float | None:

@@ -37,7 +37,7 @@ from neuros.backends.reaper import Reaper
 from neuros.backends.sidecars import Recorded, RecorderProcess
 from neuros.distribution import WORKSPACE, __version__, python_command
 from neuros.errors import UsageError
-from neuros.project.model import Folders, NodeFile, Project
+from neuros.project.model import Folders, NodeFile
 from neuros.project.split import node_file_text, project_to_json
 from neuros.project.timing import seeds
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, plan_recording
@@ -250,12 +250,30 @@ def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None
     if wanted is None:
         return None
     is_open = plan.needs_known_domain or plan.request.domain_id is not None
+    content = json.dumps(project_to_json(plan.project), sort_keys=True)
+    versions = {"neuros": __version__, "python": platform.python_version()}
+    for package in _PACKAGES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[package] = metadata.version(package)
+    seeded = {
+        f"{node}.{name}": value
+        for node, variables in seeds(plan.project.nodes).items()
+        for name, value in variables.items()
+    }
     return plan_recording(
         plan.project,
         plan.names,
         wanted,
         is_alone=not is_open and "ROS_DOMAIN_ID" not in environ,
-        custom={**_custom_data(plan.project), "backend": plan.back_end.name},
+        custom={  # metadata of the bag: text
+            "project": plan.project.name,
+            "file": str(plan.project.file),
+            "project_sha256": hashlib.sha256(content.encode()).hexdigest(),
+            "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "versions": json.dumps(versions),
+            "seeds": json.dumps(seeded),
+            "backend": plan.back_end.name,
+        },
     )
 
 
@@ -278,28 +296,3 @@ def summary(report: Mapping[str, Any]) -> str:
         of = "?" if None in passed else sum(passed)
         lines.append(f"recorded {seen} of {of} packets of connections that may lose any number")
     return "\n".join(lines)
-
-
-def _custom_data(project: Project) -> dict[str, str]:
-    """Data about the run for the metadata of the bag; each value is text."""
-    content = json.dumps(project_to_json(project), sort_keys=True)
-    versions = {"neuros": __version__, "python": platform.python_version()}
-    for package in _PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            continue
-    return {
-        "project": project.name,
-        "file": str(project.file),
-        "project_sha256": hashlib.sha256(content.encode()).hexdigest(),
-        "started": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
-        "versions": json.dumps(versions),
-        "seeds": json.dumps(
-            {
-                f"{node}.{name}": value
-                for node, variables in seeds(project.nodes).items()
-                for name, value in variables.items()
-            }
-        ),
-    }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -122,12 +122,6 @@ def run_table(record: Mapping[str, Any]) -> str:
             " initialisation and ending)"
         )
     return "\n\n".join([*parts, times])
-
-
-def consumed_percent(connection: Mapping[str, Any]) -> float | None:
-    """The share of the packets sent on a connection that were consumed, in per cent."""
-    sent, consumed = connection.get("sent"), connection.get("consumed")
-    return 100 * consumed / sent if sent and consumed is not None else None
 
 
 def _timeline(points: Sequence[Sequence[float]], ended: Outcome) -> list[list[float]]:
@@ -321,64 +315,52 @@ def broken_budgets(
 
     An unknown figure breaks its budget, unless ``is_partial``: another part of the run may know it.
     """
-    return [
-        *_excess_losses(record, budgets.lost_packets),
-        *_slowness(record, budgets.real_time_factor, is_partial),
-        *_irregular_ticks(record, budgets.tick_error_ms),
-    ]
-
-
-def _excess_losses(record: Mapping[str, Any], limits: Mapping[str, int]) -> Iterator[str]:
+    found: list[str] = []
     for connection in record["connections"]:
         name, lost, discarded = (connection[key] for key in ("connection", "lost", "discarded"))
-        limit = limits.get(name)
+        limit = budgets.lost_packets.get(name)
         if limit is None or not _has_begun(connection, record):
             continue
         if lost is None or discarded is None:
-            yield f"it is not known how many packets {name} lost; the limit is {limit}"
+            found.append(f"it is not known how many packets {name} lost; the limit is {limit}")
         elif lost + discarded > limit:
-            yield (
+            found.append(
                 f"{name} lost {lost + discarded} packets ({lost} on their way,"
                 f" {discarded} discarded); the limit is {limit}"
             )
-
-
-def _slowness(record: Mapping[str, Any], least: float | None, is_partial: bool) -> Iterator[str]:
-    factor = record["real_time_factor"]
-    if least is None:
-        return
-    owners = {n: node for n, node in record["nodes"].items() if node.get("sim_time") is not None}
-    if any(node.get("report") != "final" for node in owners.values()):
-        yield (
-            f"the real-time factor must be at least {least:g}, but is not known: the last report"
-            f" of {' and '.join(owners)} is missing"
-        )
-    elif factor is not None and factor < least:
-        yield f"the real-time factor was {factor:.3g}, but must be at least {least:g}"
-    elif factor is None and not is_partial:
-        yield (
-            f"the real-time factor must be at least {least:g}, but there was none: no node owns"
-            " simulated time, or the node that does never ran a hook"
-        )
-
-
-def _irregular_ticks(record: Mapping[str, Any], limit_ms: float | None) -> Iterator[str]:
-    if limit_ms is None:
-        return
-    for node, metrics in record["nodes"].items():
+    nodes, factor = record["nodes"], record["real_time_factor"]
+    if budgets.real_time_factor is not None:
+        text = f"the real-time factor must be at least {budgets.real_time_factor:g}, but"
+        owners = [name for name, node in nodes.items() if node.get("sim_time") is not None]
+        if any(nodes[name].get("report") != "final" for name in owners):
+            found.append(
+                f"{text} is not known: the last report of {' and '.join(owners)} is missing"
+            )
+        elif factor is None and not is_partial:
+            found.append(
+                f"{text} there was none: no node owns simulated time, or the node that does never"
+                " ran a hook"
+            )
+        elif factor is not None and factor < budgets.real_time_factor:
+            found.append(
+                f"the real-time factor was {factor:.3g}, but must be at least"
+                f" {budgets.real_time_factor:g}"
+            )
+    for node, metrics in nodes.items() if budgets.tick_error_ms is not None else ():
+        limit_text = f"the limit is {budgets.tick_error_ms:g} ms"
         ticks_of = {hook: each.get("ticks") for hook, each in (metrics.get("hooks") or {}).items()}
         if any(ticks_of.values()) and metrics.get("report") != "final":
-            yield (
-                f"it is not known how far ticks of {node} were off their period; the limit is"
-                f" {limit_ms:g} ms"
+            found.append(
+                f"it is not known how far ticks of {node} were off their period; {limit_text}"
             )
             continue
         for hook, ticks in ticks_of.items():
-            if ticks and ticks["largest_error_ms"] > limit_ms:
-                yield (
+            if ticks and ticks["largest_error_ms"] > budgets.tick_error_ms:
+                found.append(
                     f"a tick of '{hook}' of {node} was off its period by"
-                    f" {ticks['largest_error_ms']:.3g} ms; the limit is {limit_ms:g} ms"
+                    f" {ticks['largest_error_ms']:.3g} ms; {limit_text}"
                 )
+    return found
 
 
 def _has_begun(connection: Mapping[str, Any], record: Mapping[str, Any]) -> bool:

@@ -20,7 +20,7 @@ from neuros.arithmetic import differences
 from neuros.bag import Bag, RecordedTopic, open_bag
 from neuros.errors import NeurosError
 from neuros.recording.recording_plan import PLAN_NAME
-from neuros.recording.stored import stored_messages
+from neuros.recording.stored import StoredBag
 
 _LARGE_BYTES = 64 * 1024
 """From this size on, the buffers of a message travel beside it; nodes digest them apart."""
@@ -86,7 +86,7 @@ def _digests(bag: Bag) -> dict[str, tuple[Numbers, bool]]:
     times: dict[str, array[int]] = {}
     digests: dict[str, array[int]] = {}
     large: set[str] = set()
-    for topic, log_ns, _, data, _ in stored_messages(bag.folder, bag.refuse):
+    for topic, log_ns, _, data, _ in StoredBag(bag.folder).messages(bag.refuse):
         times.setdefault(topic, array("q")).append(log_ns)
         padded = data + bytes(-len(data) % 4)
         digests.setdefault(topic, array("Q")).append(xxh3_64_intdigest(padded))
@@ -266,7 +266,10 @@ class _Comparer:
             self._not_compared.append(name)
         else:
             consumed = _consumed(name, in_a, in_b)
-        consumed = consumed or self._counted(name)
+        taken = [run.connections[name].get("consumed") for run in self._runs]
+        if consumed is None and None not in taken and taken[0] != taken[1]:  # no list tells it
+            text = f"{name}: hooks took {taken[0]} packets in run A, and {taken[1]} in run B"
+            consumed = _Difference(np.inf, text)
         sent = _sent(name, in_a, in_b)
         is_lossless = self._runs[0].connections[name]["discard_limit"] == 0
         timed = _timed(name, in_a, in_b) if self._is_virtual else None
@@ -305,13 +308,6 @@ class _Comparer:
                     hashes = [values.get(name, {}).get("sha256") for values in (one, other)]
                     if hashes[0] != hashes[1]:
                         self._remarks.append(f"{node}.{name}: another value was {how} in run B")
-
-    def _counted(self, name: str) -> _Difference | None:
-        """The difference between the counters of both runs, where no lists tell it."""
-        a, b = (run.connections[name].get("consumed") for run in self._runs)
-        if a is None or b is None or a == b:
-            return None
-        return _Difference(np.inf, f"{name}: hooks took {a} packets in run A, and {b} in run B")
 
 
 def packets_of_both(

@@ -6,18 +6,16 @@ import io
 import os
 import signal
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import FrameType
 
-from neuros.api.loading import workspaces_of
 from neuros.api.plan import are_made, make_environments
 from neuros.backends.pythons import Pythons
-from neuros.errors import EnvironmentFault, UsageError
+from neuros.errors import EnvironmentFault
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import message_cache
-from neuros.project.model import NodeFile
 from neuros.recording.run_file import read_object
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -85,28 +83,6 @@ def signals_interrupt(signals: list[int]) -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def require_messages(file: NodeFile) -> None:
-    """Build the message packages of a recorded node anew if they were removed.
-
-    Raises:
-        UsageError: if the files of a removed package have changed since the run.
-        EnvironmentFault: if a package cannot be built.
-    """
-    missing = [python for python in file.messages if not python.is_dir()]
-    if not missing:
-        return
-    workspaces = workspaces_of(file.folders.project)
-    messages = Messages(workspaces, _names(missing))
-    for python in missing:
-        if python not in messages.paths:
-            (name,) = _names([python])
-            raise UsageError(
-                f"replay: message package '{name}' has changed since the run, and what was built"
-                f" for that is gone: {python.parent}"
-            )
-    build_messages(messages)
-
-
 def find_messages_of(run: Path) -> None:
     """Put the message packages of a run on the path, given its folder or its bag."""
     for folder in (run, run.parent):
@@ -118,7 +94,3 @@ def find_messages_of(run: Path) -> None:
                 paths = [str(message_cache(os.environ) / entry / "python") for entry in entries]
                 sys.path[:0] = [path for path in paths if path not in sys.path]
             return
-
-
-def _names(pythons: Iterable[Path]) -> list[str]:
-    return [python.parent.name.rpartition("-")[0] for python in pythons]

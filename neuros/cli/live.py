@@ -10,11 +10,9 @@ import argparse
 import json
 import os
 import pwd
-import select
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice, pairwise
@@ -310,8 +308,9 @@ def _watch(
     period_s: float = _ECHO_PERIOD_S,
 ) -> Iterator[NodeStatus]:
     """Statuses of a node, one each period until the run is over."""
+    from neuros.api.observation import statuses
     from neuros.backends.control_sockets import connect
-    from neuros.control import TO_OBSERVERS, GetStatus, NodeStatus, Watch
+    from neuros.control import TO_OBSERVERS
     from neuros.control.link import ControlLink
 
     try:
@@ -320,19 +319,7 @@ def _watch(
         raise EnvironmentFault(
             f"the run {session.run[:8]} does not answer ({error.strerror}): it is ending"
         ) from error
-    with closing(link):
-        link.send(Watch())
-        next_s = time.monotonic()
-        while True:
-            if time.monotonic() >= next_s:
-                next_s = time.monotonic() + period_s
-                link.send(GetStatus(wanted))
-            if not select.select([link], [], [], max(0.0, next_s - time.monotonic()))[0]:
-                continue
-            messages = link.receive()
-            if messages is None:
-                return
-            yield from (m for m in messages if isinstance(m, NodeStatus) and m.node == node)
+    return (each for each in statuses(link, lambda: wanted, period_s) if each.node == node)
 
 
 def _run(name: str) -> RunOnThisMachine:

@@ -9,7 +9,8 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from neuros.cli.common import (
@@ -220,20 +221,16 @@ def _new(options: argparse.Namespace) -> int:
     if not robot.is_file():
         raise UsageError(f"--robot {robot}: there is no such file")
     folder = folder or Path(robot.name.partition(".")[0])
-    _require_empty(folder)
-    format_ = MODELS.load(robot.suffix.lower()[1:])
-    choices = RobotChoices(options.base, options.drive)
     # First into a folder beside: after an error there is none.
-    try:
+    with _making(folder):
+        format_ = MODELS.load(robot.suffix.lower()[1:])
+        choices = RobotChoices(options.base, options.drive)
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".new-", dir=folder.parent) as draft:
             inside = Path(draft) / folder.name
             inside.mkdir()
             rows = format_.make_project(robot, inside, os.environ, choices)
             shutil.copytree(inside, folder, dirs_exist_ok=True)
-    except OSError as error:
-        reason = error.strerror or error
-        raise UsageError(f"{folder} cannot be made ({reason}): name another folder") from error
     print("\n".join(rows))
     print(f"made {folder}; the next command: neuros launch {folder} --dashboard")
     return 0
@@ -286,11 +283,13 @@ def _example(options: argparse.Namespace) -> int:
     return 0
 
 
-def _require_empty(folder: Path) -> None:
-    """Raise ``UsageError`` if there is something in a folder already."""
+@contextmanager
+def _making(folder: Path) -> Iterator[None]:
+    """Raise ``UsageError`` if there is something in a folder already, or it cannot be made."""
     try:
         if folder.exists() and not (folder.is_dir() and not any(folder.iterdir())):
             raise UsageError(f"{folder} exists already: name another folder")
+        yield
     except OSError as error:
         reason = error.strerror or error
         raise UsageError(f"{folder} cannot be made ({reason}): name another folder") from error
@@ -302,8 +301,7 @@ def _copy(source: Path, folder: Path, renamed: Mapping[str, str]) -> None:
     Raises:
         UsageError: if there is something in the folder already, or it cannot be written.
     """
-    _require_empty(folder)
-    try:
+    with _making(folder):
         skipped = shutil.ignore_patterns("__pycache__", "runs")
         shutil.copytree(
             source, folder, ignore=skipped, copy_function=shutil.copyfile, dirs_exist_ok=True
@@ -313,6 +311,3 @@ def _copy(source: Path, folder: Path, renamed: Mapping[str, str]) -> None:
             for old, new in renamed.items():
                 text = text.replace(old, new)
             file.write_text(text, "utf-8")
-    except OSError as error:
-        reason = error.strerror or error
-        raise UsageError(f"{folder} cannot be made ({reason}): name another folder") from error

@@ -13,14 +13,14 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TYPE_CHECKING
 
 from neuros.backends.sidecars import END
 from neuros.errors import NeurosError
 from neuros.ordinary_files import reason_of
-from neuros.recording.recorder import Recorder, counts_of, repair, the_only_recorder
+from neuros.recording.recorder import Arrived, Recorder, counts_of, repair, the_only_recorder
 from neuros.recording.recording_plan import BAG_NAME, RecordingPlan, Topic, load_plan
-from neuros.recording.spool import ListenedSpool
 
 if TYPE_CHECKING:
     from neuros.transport.ros_topics import RosTopic
@@ -73,8 +73,9 @@ class _Problems:
 
 
 def _record(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) -> dict[str, int]:
-    with the_only_recorder(run), _listening(run, plan, complain) as unheard:
-        recorder = Recorder(plan, run, complain)
+    arrived: SimpleQueue[Arrived] = SimpleQueue()
+    with the_only_recorder(run), _listening(plan, arrived, complain) as unheard:
+        recorder = Recorder(plan, run, complain, arrived=arrived)
         try:
             while True:
                 wait_s = 0.0 if recorder.poll() else _POLL_S
@@ -98,22 +99,21 @@ def _record(run: Path, plan: RecordingPlan, complain: Callable[[str], object]) -
 
 @contextlib.contextmanager
 def _listening(
-    run: Path, plan: RecordingPlan, complain: Callable[[str], object]
+    plan: RecordingPlan, arrived: SimpleQueue[Arrived], complain: Callable[[str], object]
 ) -> Iterator[Callable[[], list[str]]]:
-    """Record topics of others in a thread; yields its end, which returns the unpublished ones."""
+    """Receive topics of others in a thread; yields its end, which returns the unpublished ones."""
     if not plan.listen:
         yield list
         return
     from neuros.transport.ros_topics import Listener
 
-    spool = ListenedSpool(run)
     unheard = list(plan.wanted)
 
     def found(topic: RosTopic) -> Callable[[int, bytes], None]:
         if topic.name in unheard:
             unheard.remove(topic.name)
-        number = spool.add(Topic(**asdict(topic)))
-        return lambda wall_ns, data: spool.keep(number, wall_ns, data)
+        known = Topic(**asdict(topic))
+        return lambda wall_ns, data: arrived.put((known, wall_ns, data))
 
     def refused(name: str, reason: str) -> None:
         if name in unheard:
@@ -130,7 +130,6 @@ def _listening(
     def stop() -> list[str]:
         listener.stop()
         thread.join()
-        spool.close()
         return unheard
 
     try:

@@ -1,4 +1,4 @@
-"""What plugins keep beyond a run (``node.keep``): weights, above all.
+"""Values that plugins keep beyond a run (``node.keep``), such as weights.
 
 The file of a value is an ``.npz`` file of NumPy. Arrays are entries of it, so ``numpy.load`` shows
 them; the entry ``structure.json`` tells where they belong. Nothing in it is ever executed

@@ -59,14 +59,9 @@ _KNOWN_PREFIXES = (
 
 def mistakes(parsed: ParsedProject) -> list[Problem]:
     """All parts that do not fit together, at most ``MOST_PROBLEMS`` from each check."""
-    parts = (_nodes, _ports, _copies, _connections, dashboard_mistakes)
+    parts = (_nodes, _ports, _connections, dashboard_mistakes)
     checks = (*parts, _names, _parameters, _timing)
     return [problem for check in checks for problem in islice(check(parsed), MOST_PROBLEMS)]
-
-
-def remarks(parsed: ParsedProject) -> list[Problem]:
-    """Possible mistakes in a project without mistakes, but for :func:`unconnected_ports`."""
-    return [*_gazebo_remarks(parsed), *_qos_remarks(parsed)]
 
 
 def _ports_of(node: Element) -> Iterator[tuple[Element, Side]]:
@@ -104,22 +99,8 @@ def copies_of(node: Element) -> int | None:
     return int(value) if value >= 1 and value % 1 == 0 else None
 
 
-def _copies(parsed: ParsedProject) -> Iterator[Problem]:
-    """Ports of nodes with copies that have no room for an axis of copies. Time is that of all."""
-    for node in parsed.nodes:
-        for port, side in _ports_of(node) if copies_of(node) is not None else ():
-            written, hint = port.string("type") or "", _where(node, "copies")
-            if normalised(written) not in (None, CLOCK_TYPE) and array_type(written) is None:
-                text = f"each {side[:-1]} of a node with copies is an array, not {written}"
-                yield port.value["type"].problem(text, f"write it like 'float64[18]'; {hint}")
-            if port.member("mujoco") is not None:
-                text = "sensors and actuators are of one world, and the node has copies"
-                hint = f"its plugin reads them from MuJoCoWorlds; {hint}"
-                yield port.value["mujoco"].key_problem(text, hint)
-
-
 def _ports(parsed: ParsedProject) -> Iterator[Problem]:
-    """Names of ports that occur twice, and QoS of ports that have no external topic."""
+    """Names that occur twice, QoS without an external topic, no room for an axis of copies."""
     first: dict[tuple[int, Side, str], Element] = {}
     for index, node in enumerate(parsed.nodes):
         for port, side in _ports_of(node):
@@ -133,6 +114,16 @@ def _ports(parsed: ParsedProject) -> Iterator[Problem]:
                     f"'qos' is for external topics, but this {side[:-1]} has no external topic",
                     "the QoS of a connection follows from its discard_limit and queue_size",
                 )
+            if copies_of(node) is None:
+                continue
+            written, hint = port.string("type") or "", _where(node, "copies")
+            if normalised(written) not in (None, CLOCK_TYPE) and array_type(written) is None:
+                text = f"each {side[:-1]} of a node with copies is an array, not {written}"
+                yield port.value["type"].problem(text, f"write it like 'float64[18]'; {hint}")
+            if port.member("mujoco") is not None:
+                text = "sensors and actuators are of one world, and the node has copies"
+                hint = f"its plugin reads them from MuJoCoWorlds; {hint}"
+                yield port.value["mujoco"].key_problem(text, hint)
 
 
 def _connections(parsed: ParsedProject) -> Iterator[Problem]:
@@ -248,20 +239,6 @@ def unconnected_ports(parsed: ParsedProject) -> Iterator[Problem]:
                 yield port.problem(text)
 
 
-def _qos_remarks(parsed: ParsedProject) -> Iterator[Problem]:
-    """QoS without effect."""
-    for node in parsed.nodes:
-        for port, _ in _ports_of(node):
-            qos = port.member("qos")
-            policies = qos and (qos.string("reliability"), qos.string("durability"))
-            if qos is not None and policies == ("best_effort", "transient_local"):
-                yield qos.problem(
-                    "transient_local has no effect with best_effort: a subscriber that comes later"
-                    " gets nothing",
-                    "make it reliable",
-                )
-
-
 def _where(element: Element, key: str = "") -> str:
     """The place of an element, or of its key, as a hint."""
     return f"see {(element.value[key] if key else element).where}"
@@ -307,30 +284,28 @@ def _too_long(topic: str) -> str:
 def _parameters(parsed: ParsedProject) -> Iterator[Problem]:
     """Values that ROS has no type for, and parameters that occur twice."""
     for node in parsed.nodes:
-        yield from _group_mistakes(node.members("parameters"), "", {})
-
-
-def _group_mistakes(
-    group: Mapping[str, Element], prefix: str, seen: dict[str, Element]
-) -> Iterator[Problem]:
-    for name, member in group.items():
-        full = prefix + name
-        if isinstance(member.value, dict):
-            yield from _group_mistakes(member.value, f"{full}.", seen)
-            continue
-        if seen.setdefault(full, member) is not member:
-            yield member.key_problem(f"the parameter '{full}' occurs twice")
-        if full in _TRUTH_VALUES and not isinstance(member.value, bool):
-            yield member.problem("must be true or false, as ROS declares it")
-        values = member.value if isinstance(member.value, list) else [member]
-        kinds = {_KINDS.get(type(each.value), "other values") for each in values}
-        if len(kinds) > 1:
-            yield member.problem(
-                f"the list has {' and '.join(sorted(kinds))}", "ROS has lists of one kind only"
-            )
-        for each in values:
-            if type(each.value) is int and not -_INT64 <= each.value < _INT64:
-                yield each.problem("is too large for an integer of ROS, which has 64 bits")
+        seen: dict[str, Element] = {}
+        waiting = [*node.members("parameters").items()]
+        while waiting:
+            full, member = waiting.pop(0)
+            if isinstance(member.value, dict):
+                inner = member.value.items()
+                waiting[:0] = [(f"{full}.{name}", each) for name, each in inner]
+                continue
+            if seen.setdefault(full, member) is not member:
+                yield member.key_problem(f"the parameter '{full}' occurs twice")
+            if full in _TRUTH_VALUES and not isinstance(member.value, bool):
+                yield member.problem("must be true or false, as ROS declares it")
+            values = member.value if isinstance(member.value, list) else [member]
+            kinds = {_KINDS.get(type(each.value), "other values") for each in values}
+            if len(kinds) > 1:
+                yield member.problem(
+                    f"the list has {' and '.join(sorted(kinds))}", "ROS has lists of one kind only"
+                )
+            for each in values:
+                if type(each.value) is int and not -_INT64 <= each.value < _INT64:
+                    text = "is too large for an integer of ROS, which has 64 bits"
+                    yield each.problem(text)
 
 
 # ---------------------------------------------------------------------- virtual time
@@ -378,7 +353,7 @@ def _impossible(duration: Element, least_ns: int = 0) -> Iterator[Problem]:
         yield duration.problem(f"a delay {text}, but may be {distribution.least_ns / 1e9:g} s")
 
 
-# ---------------------------------------------------------------------- Gazebo, of NeuROS 1.0
+# ---------------------------------------------------------------------- remarks; Gazebo, of 1.0
 
 
 def container_in_place_of(name: str) -> str:
@@ -391,9 +366,20 @@ def is_for_gazebo(variable: str) -> bool:
     return variable.startswith(_GAZEBO_PREFIXES)
 
 
-def _gazebo_remarks(parsed: ParsedProject) -> Iterator[Problem]:
-    """Containers, environment variables and ports of Gazebo, which have no meaning here."""
+def remarks(parsed: ParsedProject) -> Iterator[Problem]:
+    """Possible mistakes in a project without mistakes, but for :func:`unconnected_ports`.
+
+    They are QoS without effect, and what belongs to Gazebo, which has no meaning here.
+    """
     for node in parsed.nodes:
+        for qos in (port.member("qos") for port, _ in _ports_of(node)):
+            policies = qos and (qos.string("reliability"), qos.string("durability"))
+            if qos is not None and policies == ("best_effort", "transient_local"):
+                yield qos.problem(
+                    "transient_local has no effect with best_effort: a subscriber that comes later"
+                    " gets nothing",
+                    "make it reliable",
+                )
         container = node.string("container") or ""
         if container in _STAND_INS:
             yield node.value["container"].problem(

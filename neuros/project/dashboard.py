@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
 from neuros.errors import Problem
 from neuros.project.message_types import misfit, normalised, ros_type
@@ -34,12 +33,6 @@ _KEYS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "activity": (("output",), ("field", "seconds")),
 }
 _SIZE = ("panel", "width", "height")
-
-
-def dashboard_of(parsed: ParsedProject) -> Mapping[str, Any] | None:
-    """The layout in a valid project file; ``None`` if it has none."""
-    element = parsed.root.member("dashboard")
-    return None if element is None else element.plain
 
 
 def dashboard_mistakes(parsed: ParsedProject) -> Iterator[Problem]:

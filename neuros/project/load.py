@@ -18,7 +18,6 @@ from neuros.project.checks import (
     unconnected_ports,
     unread_variables,
 )
-from neuros.project.dashboard import dashboard_of
 from neuros.project.in_python import FILE, PythonProject
 from neuros.project.message_types import (
     NO_PACKAGES,
@@ -46,10 +45,9 @@ from neuros.project.model import (
 )
 from neuros.project.parsed import (
     ParsedProject,
-    apply_namespace,
+    apply_option,
     apply_override,
     apply_remaps,
-    apply_time,
     names_of,
     parse_project,
 )
@@ -275,10 +273,9 @@ def load_project(
         raise ProjectError([error.problem]) from None
     for text in overrides:
         parsed.problems += apply_override(parsed, text)
-    if namespace is not None:
-        apply_namespace(parsed, namespace)
+    apply_option(parsed, "namespace", namespace)
+    apply_option(parsed, "time", time)
     parsed.problems += apply_remaps(parsed, remap)
-    apply_time(parsed, time)
     if timing is not None:
         parsed.problems += apply_timing(parsed, timing)
     builder = _Builder(parsed)
@@ -299,20 +296,20 @@ def load_project(
         raise ProjectError(problems)
     if reads_plugins:
         doubts += unread_variables(parsed, nodes, overrides)
-    element = parsed.root.member("budgets")
-    budgets: dict[str, Any] = {} if element is None else element.plain
+    keys = parsed.root.plain
+    budgets: dict[str, Any] = keys.get("budgets", {})
     lost = {name: int(most) for name, most in budgets.get("lost_packets", {}).items()}
     project = Project(
         name=_name(roots.project, file),
         nodes=nodes,
         connections=connections,
         file=roots.project / file.name,
-        description=parsed.root.string("description") or "",
+        description=keys.get("description", ""),
         budgets=Budgets(**{**budgets, "lost_packets": lost}),
         names=names,
-        dashboard=dashboard_of(parsed),
-        is_portable=parsed.root.plain.get("portable", False),
-        time=parsed.root.string("time") or REAL,
+        dashboard=keys.get("dashboard"),
+        is_portable=keys.get("portable", False),
+        time=keys.get("time", REAL),
     )
     loose = [*unconnected_ports(parsed)]
     told = (*sorted([*remarks(parsed), *loose]), *doubts)

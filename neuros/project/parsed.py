@@ -245,24 +245,17 @@ def _key(parent: Element, step: str, source: Source) -> str | int:
     raise SourceError(source.problem(start, f"{parent.pointer}/{escape(step)}", text, hint))
 
 
-def apply_namespace(parsed: ParsedProject, text: str) -> None:
-    """Replace the namespace of a parsed project by that of ``--namespace``."""
-    if isinstance(parsed.root.value, dict):
-        source = Source(f"--namespace {text}", parsed.roots.project, text)
-        parsed.root.value["namespace"] = Element(text, source, 0, len(text), "/namespace")
+def apply_option(parsed: ParsedProject, key: str, text: str | None) -> None:
+    """Replace a key of a parsed project by the text of the option of that name, if it is given."""
+    if text is not None and isinstance(parsed.root.value, dict):
+        source = Source(f"--{key} {text}", parsed.roots.project, text)
+        parsed.root.value[key] = Element(text, source, 0, len(text), f"/{key}")
 
 
 def connection_name(connection: Element) -> str:
     """The name of a connection, as messages show it; empty if an end is missing."""
     ends = [connection.string(end) for end in ENDS]
     return "" if None in ends else "{}.{} -> {}.{}".format(*ends)
-
-
-def apply_time(parsed: ParsedProject, time: str | None) -> None:
-    """Replace the clock of a parsed project by that of ``--time``."""
-    if time is not None and isinstance(parsed.root.value, dict):
-        source = Source(f"--time {time}", parsed.roots.project, time)
-        parsed.root.value["time"] = Element(time, source, 0, len(time), "/time")
 
 
 def apply_remaps(parsed: ParsedProject, texts: Sequence[str]) -> list[Problem]:

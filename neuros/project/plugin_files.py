@@ -448,25 +448,22 @@ class _Reader:
                 given[keyword.arg] = keyword.value
         if not is_known:
             return unknown
+        is_batch, batch = None, given.get("batch")
+        try:
+            is_batch = batch_of(False if batch is None else ast.literal_eval(batch))
+        except UsageError as error:
+            self._fail(function, batch or function, str(error))
+        except (TypeError, ValueError):  # it is computed
+            pass
         return PluginHook(
             function.name,
             self._ports(function, given.get("inputs"), "input"),
             self._ports(function, given.get("outputs"), "output"),
             self._sim_tick(function, decorator, given) if kind == "neuros_tick" else None,
             kind,
-            self._is_batch(function, given.get("batch")),
+            is_batch,
             (decorator.lineno, decorator.col_offset + 1),
         )
-
-    def _is_batch(self, function: _Function, written: ast.expr | None) -> bool | None:
-        """Whether the hook takes batches, ``None`` where that is computed."""
-        try:
-            return batch_of(False if written is None else ast.literal_eval(written))
-        except UsageError as error:
-            self._fail(function, written or function, str(error))
-        except (TypeError, ValueError):
-            pass
-        return None
 
     def _sim_tick(
         self, function: _Function, decorator: ast.expr, given: Mapping[str, ast.expr]

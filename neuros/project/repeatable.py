@@ -1,4 +1,4 @@
-"""Whether a project does the same again, as far as its files and plugins tell.
+"""Reasons why a second run of a project may differ, as far as its files and plugins tell.
 
 ``docs/deterministic_runs.md`` has the conditions.
 """
@@ -21,16 +21,13 @@ def why_not_repeatable(project: Project, *, is_stepped: bool = False) -> list[st
     """
     if project.is_virtual:  # what cannot be repeated there is refused at the start
         return []
-    return [*_threads(project), *(() if is_stepped else _outside(project))]
-
-
-def _threads(project: Project) -> Iterator[str]:
-    for node in project.nodes:
-        if any(plugin.sends_by_itself for plugin in plugins_of(node)):
-            yield (
-                f"{node.name}: its plugin sends from a thread (run_asynchronous, submit), when that"
-                " comes to it: let a hook step the simulator"
-            )
+    threads = [
+        f"{node.name}: its plugin sends from a thread (run_asynchronous, submit), when that comes"
+        " to it: let a hook step the simulator"
+        for node in project.nodes
+        if any(plugin.sends_by_itself for plugin in plugins_of(node))
+    ]
+    return threads if is_stepped else [*threads, *_outside(project)]
 
 
 def _outside(project: Project) -> Iterator[str]:

@@ -27,6 +27,10 @@ MOST_PROBLEMS = 200
 """Of one check: nobody reads more, and a search for all can take minutes."""
 SCHEMA_FOLDER = Path(__file__).resolve().parents[1] / "schema"
 
+_NAMES = {
+    bool: "boolean", dict: "object", list: "array", str: "string", int: "integer",
+    type(None): "null",
+}  # fmt: skip
 _KINDS = {
     "object": "an object",
     "array": "a list",
@@ -200,7 +204,9 @@ def _sentence(error: Any) -> tuple[str, str]:
     if error.validator == "type":
         kinds = [expected] if isinstance(expected, str) else expected
         allowed = " or ".join(_KINDS[kind] for kind in kinds)
-        return f"must be {allowed}, but is {_kind_of(found)}", ""
+        is_finite = isinstance(found, float) and math.isfinite(found)
+        kind = _KINDS.get(_NAMES.get(type(found), ""), f"{found}")
+        return f"must be {allowed}, but is {'a number with a fraction' if is_finite else kind}", ""
     if error.validator == "pattern":
         title = error.schema.get("title", "text").lower()
         return f"{_shown(found)} is not allowed as {title}", _hint(error.schema)
@@ -229,17 +235,6 @@ def _sentence(error: Any) -> tuple[str, str]:
 
 def _hint(schema_part: dict[str, Any]) -> str:
     return str(schema_part.get("$comment", ""))
-
-
-def _kind_of(value: Any) -> str:
-    for kind, types in (
-        ("boolean", bool), ("object", dict), ("array", list), ("string", str), ("integer", int)
-    ):  # fmt: skip
-        if isinstance(value, types):
-            return _KINDS[kind]
-    if value is None:
-        return "null"
-    return "a number with a fraction" if math.isfinite(value) else f"{value}"
 
 
 def _shown(value: Any) -> str:

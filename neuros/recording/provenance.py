@@ -93,13 +93,16 @@ def installed_packages(folders: Iterable[str]) -> dict[str, str]:
 
 def machine() -> dict[str, Any]:
     """Name, processor, cores, memory in bytes and system of this machine."""
+    system = None
+    with contextlib.suppress(OSError):
+        system = platform.freedesktop_os_release().get("PRETTY_NAME")
     return {
         "name": platform.node(),
         "processor": processor(),
         "cores": os.cpu_count(),
         "usable_cores": len(os.sched_getaffinity(0)),
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
-        "system": _first("/etc/os-release", "PRETTY_NAME"),
+        "system": system,
     }
 
 
@@ -144,12 +147,3 @@ def _git(folder: Path, *arguments: str) -> str | None:
     except (OSError, subprocess.TimeoutExpired):  # there is no git, or its disk does not answer
         return None
     return asked.stdout.decode(errors="replace") if asked.returncode == 0 else None
-
-
-def _first(file: str, key: str) -> str | None:
-    """The first value of a key in a file of lines such as ``key : value`` or ``KEY="value"``."""
-    with contextlib.suppress(OSError), open(file, encoding="utf-8", errors="replace") as lines:
-        for line in lines:
-            if line.startswith(key):
-                return line[len(key) :].strip().lstrip(":=").strip().strip('"')
-    return None

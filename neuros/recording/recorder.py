@@ -9,22 +9,22 @@ import contextlib
 import errno
 import fcntl
 import json
+import os
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import itemgetter
 from pathlib import Path
+from queue import SimpleQueue
 from typing import TypeAlias
 
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.ordinary_files import open_ordinary, reason_of
+from neuros.ordinary_files import reason_of
 from neuros.project.scanner import read_bytes
 from neuros.recording.bag_writer import BagWriter
 from neuros.recording.recording_plan import (
     BAG_NAME,
-    LISTENER,
-    PLAN_NAME,
     RecordingPlan,
     Topic,
     load_plan,
@@ -35,10 +35,8 @@ from neuros.recording.spool import (
     ForwardClock,
     SpoolReader,
     SpoolRecord,
-    forget_listened,
-    listened_topics,
 )
-from neuros.recording.stored import StoredBag, faults_of, is_whole, stored_messages
+from neuros.recording.stored import StoredBag, faults_of, is_whole
 
 # A packet is in its spool this long after its time, unless its process was kept from running.
 # Readers of bags sort, so a packet that comes later does no harm.
@@ -48,6 +46,7 @@ _ALL_NS = (1 << 63) - 1
 
 _Kept: TypeAlias = "tuple[int, int, tuple[int, ...], bytes, bool]"
 _IsNew: TypeAlias = Callable[[int, int], bool]
+Arrived: TypeAlias = "tuple[Topic, int, bytes]"
 DAMAGED_NAME = "bag.damaged"
 KEPT_NAME = "bag.before_repair"
 
@@ -59,6 +58,7 @@ class Recorder:
         run: the run folder.
         complain: receives each problem, a sentence.
         is_new: whether the bag lacks the packet of a topic, by its number, at a wall time.
+        arrived: topic, wall time and content of packets that no node sees, from another thread.
         clock: monotonic, in seconds; tells when a flush is due.
 
     Raises:
@@ -71,12 +71,14 @@ class Recorder:
         run: Path,
         complain: Callable[[str], object],
         is_new: _IsNew | None = None,
+        arrived: SimpleQueue[Arrived] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._plan = plan
         self._run = run
         self._complain = complain
         self._is_new = is_new
+        self._arrived: SimpleQueue[Arrived] = arrived or SimpleQueue()
         self._clock = clock
         self.bag = BagWriter(run / BAG_NAME, plan.custom)
         self.topics: dict[Topic, int | None] = {}
@@ -93,8 +95,6 @@ class Recorder:
             )
             for node, streams in plan.streams.items()
         ]
-        self._listener = _SpoolSource(SpoolReader(run / LISTENER), [], owns_time=False)
-        self._sources.append(self._listener)
         self._held: list[_Kept] = []
         self._wall_clock = ForwardClock()
         self._sim_ns = 0
@@ -140,8 +140,6 @@ class Recorder:
         """Remove the spools, whose packets are in the bag."""
         for source in self._sources:
             source.reader.close(remove=not source.is_damaged)
-        if not self._listener.is_damaged:
-            forget_listened(self._run)
 
     def abandon(self) -> None:
         """Stop, and leave bag and spools unfinished."""
@@ -173,6 +171,12 @@ class Recorder:
                 has_more = True
                 last_ns = records[-1].wall_ns
                 horizon_ns = last_ns if horizon_ns is None else min(horizon_ns, last_ns)
+        while not self._arrived.empty():
+            topic, wall_ns, data = self._arrived.get()
+            if topic not in self._plan.topics:  # a repair of the bag has to know it
+                self._plan = replace(self._plan, topics=(*self._plan.topics, topic))
+                self._plan.save(self._run)
+            self._held.append((wall_ns, NO_TIME, self._numbers([topic]), data, False))
         self._held.sort(key=itemgetter(0))
         written = 0
         for kept in self._held:
@@ -192,9 +196,6 @@ class Recorder:
             records, is_capped = source.reader.read(_MOST_BYTES)
             if source.reader.is_damaged:
                 self._complain_of(source)
-            if source is self._listener and records:
-                heard = listened_topics(self._run)
-                self._listener.topics = [self._numbers([topic]) for topic in heard]
             return records, is_capped
         except OSError as error:
             source.has_failed = source.is_damaged = True
@@ -255,13 +256,15 @@ class _SpoolSource:
 @contextlib.contextmanager
 def the_only_recorder(run: Path) -> Iterator[bool]:
     """Lock the bag of a run within the block; yields whether no other process writes it."""
-    with open_ordinary(run / PLAN_NAME) as plan:
-        try:
-            fcntl.flock(plan, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    folder = os.open(run, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        is_alone = False
+        with contextlib.suppress(OSError):
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
             is_alone = True
-        except OSError:
-            is_alone = False
         yield is_alone
+    finally:
+        os.close(folder)
 
 
 def needs_repair(run: Path, plan: RecordingPlan) -> bool:
@@ -269,7 +272,7 @@ def needs_repair(run: Path, plan: RecordingPlan) -> bool:
     if (run / DAMAGED_NAME).exists() or not is_whole(run / BAG_NAME):
         return True
     try:
-        return any(SpoolReader(run / name).has_files for name in (*plan.streams, LISTENER))
+        return any(SpoolReader(run / name).has_files for name in plan.streams)
     except OSError:
         return True  # the repair tells the reason
 
@@ -306,7 +309,7 @@ def repair(
     try:
         with the_only_recorder(run) as is_alone:
             # A node may go on though its recorder does not.
-            spools = (SpoolReader(run / name) for name in (*plan.streams, LISTENER))
+            spools = (SpoolReader(run / name) for name in plan.streams)
             if not is_alone or any(spool.is_fed for spool in spools):
                 raise EnvironmentFault(f"{run} is still being recorded: wait for its end")
             if not needs_repair(run, plan) and not faults_of(
@@ -359,7 +362,7 @@ def counts_of(run: Path) -> dict[str, int]:
 def _rebuild(
     run: Path, plan: RecordingPlan, complain: Callable[[str], object], *, keeps_changed: bool
 ) -> Repaired:
-    topics = {topic.name: topic for topic in (*plan.topics, *listened_topics(run))}
+    topics = {topic.name: topic for topic in plan.topics}
     bag, damaged, recorded = run / BAG_NAME, run / DAMAGED_NAME, recorded_counts(run)
     for folder in (bag, damaged):
         if folder.is_symlink():
@@ -380,7 +383,7 @@ def _rebuild(
 
     recorder = Recorder(plan, run, complain, lambda topic, wall_ns: (topic, wall_ns) not in present)
     try:
-        for message in stored_messages(damaged, add_fault) if damaged.exists() else ():
+        for message in StoredBag(damaged).messages(add_fault) if damaged.exists() else ():
             if message.may_have_changed:
                 changed += 1
                 if not keeps_changed:

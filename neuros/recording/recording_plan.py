@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 from neuros.control.link import read_as
 from neuros.errors import ControlError, EnvironmentFault, UsageError
+from neuros.ordinary_files import write_whole
 from neuros.ports import Way
 from neuros.project.model import Project
 from neuros.project.names import INTERNAL
@@ -25,8 +26,6 @@ from neuros.recording.run_file import read_object
 CLOCK = "/clock"
 PLAN_NAME = "recording.json"
 BAG_NAME = "bag"
-LISTENER = ".listener"
-"""Folder of packets that no node sees; no node can have its name."""
 
 _VERSION = 1
 _NODE_NAME = re.compile(r"_?[A-Za-z][A-Za-z0-9_]{,250}")  # a folder has this name
@@ -71,6 +70,7 @@ class RecordingPlan:
     """All that is recorded of a run.
 
     Attributes:
+        topics: of the bag; the recorder adds those of others when their senders appear.
         streams: by node, in the order of their numbers in its spool.
         listen: topics that the recorder subscribes to itself.
         wanted: those of ``listen`` that the user has named.
@@ -90,7 +90,7 @@ class RecordingPlan:
     def save(self, run: Path) -> None:
         """Write the plan into the run folder. Raises ``OSError``."""
         content = {"version": _VERSION, **asdict(self)}
-        (run / PLAN_NAME).write_text(json.dumps(content, indent=2) + "\n", "utf-8")
+        write_whole(run / PLAN_NAME, f"{json.dumps(content, indent=2)}\n".encode())
 
 
 def load_plan(run: Path) -> RecordingPlan:
@@ -188,7 +188,14 @@ def plan_recording(
         and (request.everything or is_named(each.topic.name, each.topic.connection, request.topics))
     ]
     known = {each.topic.name for each in candidates}
-    wanted = _asked_of_ros(request, known, project)
+    passing = [(each.topic.name, each.topic.connection) for each in candidates]
+    wanted: dict[str, None] = {}  # topics that only the ROS graph can know
+    for text in request.topics:
+        if any(is_named(name, label, [text]) for name, label in passing):
+            continue
+        if not _may_be_on_graph(text, project) or set(text) & set("*?["):
+            raise _unknown("--topic", text, project)
+        wanted[text] = None
     listen = list(wanted)
     clock = project.names.resolve(CLOCK, "")
     if request.everything and not is_alone and clock not in known:
@@ -201,7 +208,7 @@ def plan_recording(
         listen=tuple(
             name for name in dict.fromkeys(listen) if not is_named(name, None, request.exclude)
         ),
-        wanted=wanted,
+        wanted=tuple(wanted),
         time_owner=owners[0] if len(owners) == 1 else None,
         custom=custom,
         flush_interval=request.flush_interval,
@@ -266,28 +273,6 @@ def is_named(name: str, connection: str | None, patterns: Sequence[str]) -> bool
     if connection:
         words += [connection, connection.partition(" -> ")[0]]
     return any(fnmatchcase(word, pattern) for word in words for pattern in patterns)
-
-
-def _asked_of_ros(
-    request: RecordingRequest, known: Collection[str], project: Project
-) -> tuple[str, ...]:
-    """Topics of the request that only the ROS graph can know.
-
-    Raises:
-        UsageError: for a topic that can be neither on the graph nor in the project.
-    """
-    labels = {str(connection): f"{connection.topic}/data" for connection in project.connections}
-    found: dict[str, None] = {}
-    for text in request.topics:
-        is_in_project = any(fnmatchcase(name, text) for name in known) or any(
-            is_named(name, label, [text]) for label, name in labels.items() if name in known
-        )
-        if is_in_project:
-            continue
-        if not _may_be_on_graph(text, project) or set(text) & set("*?["):
-            raise _unknown("--topic", text, project)
-        found[text] = None
-    return tuple(found)
 
 
 def _may_be_on_graph(text: str, project: Project) -> bool:

@@ -13,26 +13,20 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import json
 import os
 import re
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
-from neuros.control.link import read_as
-from neuros.errors import ControlError
-from neuros.ordinary_files import write_whole
 from neuros.ports import Way
-from neuros.project.scanner import read_bytes
-from neuros.recording.recording_plan import LISTENER, RecordedStream, RecordingPlan, Topic
+from neuros.recording.recording_plan import RecordedStream, RecordingPlan
 
 FILE_BYTES = 8 << 20
 MOST_BYTES = 1 << 27
-"""The largest packet. A sparse file of a node could claim any size."""
+"""The largest packet."""
 NO_TIME = -1
 
 _FOLDER = "spool"
@@ -271,64 +265,3 @@ def _missing(rest: bytes) -> int:
     if len(rest) >= whole:
         whole += _HEADER.unpack_from(rest)[0]
     return whole - len(rest)
-
-
-_LIST = "topics.json"
-
-
-class ListenedSpool:
-    """Spool of the recorder, for topics that are known only when a sender appears.
-
-    The list of topics is written before the first packet of each, for all readers of the spool.
-    """
-
-    def __init__(self, run: Path) -> None:
-        self._run = run
-        self._topics: list[Topic] = []
-        self._spool = SpoolWriter(run / LISTENER, ())
-
-    def add(self, topic: Topic) -> int:
-        """The number of a new topic. Raises ``OSError``."""
-        self._topics.append(topic)
-        text = json.dumps([asdict(each) for each in self._topics])
-        (self._run / LISTENER).mkdir(exist_ok=True)
-        write_whole(self._run / LISTENER / _LIST, text.encode())
-        return len(self._topics) - 1
-
-    def keep(self, number: int, wall_ns: int, data: bytes) -> None:
-        """Keep a packet. Raises ``OSError``."""
-        self._spool.append(wall_ns, NO_TIME, number, data)
-
-    def close(self) -> None:
-        """Close the spool."""
-        self._spool.close()
-
-
-def listened_topics(run: Path) -> list[Topic]:
-    """The topics that the recorder has received so far, in the order of their numbers.
-
-    Raises:
-        OSError: if the list cannot be read.
-    """
-    path = run / LISTENER / _LIST
-    try:
-        content = json.loads(read_bytes(path))
-        json.dumps(content, ensure_ascii=False).encode()  # the bag must be able to hold it
-        return [read_as(Topic, each) for each in content]
-    except FileNotFoundError:
-        return []
-    except (ControlError, RecursionError, TypeError, ValueError) as error:
-        raise OSError(
-            errno.EIO,
-            f"it is damaged ({error}); without {path.parent}, neuros bag repair completes the bag"
-            " except for topics that no node has",
-            str(path),
-        ) from error
-
-
-def forget_listened(run: Path) -> None:
-    """Remove the list of topics, if possible; its spool must have been removed before."""
-    with contextlib.suppress(OSError):
-        for name in (_LIST, f".{_LIST}"):
-            (run / LISTENER / name).unlink(missing_ok=True)
-        (run / LISTENER).rmdir()

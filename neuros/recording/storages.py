@@ -280,7 +280,14 @@ class McapFile:
                 if is_complete:
                     raise
                 note = f"{self._path.name} has no end: what is there was recorded before"
-            if (found := known.statistics) is not None and _is_full(known):
+            # A summary need not repeat all channels and their schemas.
+            channels, schemas = known.channels, {0, *known.schemas}
+            if (
+                (found := known.statistics) is not None
+                and channels.keys() >= found.channel_message_counts.keys()
+                and all(channel.schema_id in schemas for channel in channels.values())
+                and len(channels) == found.channel_count
+            ):
                 counts: Mapping[int, int] = found.channel_message_counts
                 first_ns, last_ns = found.message_start_time, found.message_end_time
                 if not found.message_count:
@@ -344,15 +351,6 @@ def _names(known: Summary) -> dict[int, str]:
         is_same = types.setdefault(channel.topic, kind) == kind
         found[channel.id] = channel.topic if is_same else f"{channel.topic} ({kind})"
     return found
-
-
-def _is_full(summary: Summary) -> bool:
-    """Whether a summary repeats all channels and their schemas, which it need not."""
-    assert summary.statistics is not None
-    channels, schemas = summary.channels, {0, *summary.schemas}
-    return channels.keys() >= summary.statistics.channel_message_counts.keys() and all(
-        channel.schema_id in schemas for channel in channels.values()
-    ) and len(channels) == summary.statistics.channel_count  # fmt: skip
 
 
 def _summary_of(file: BinaryIO) -> Summary:

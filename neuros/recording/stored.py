@@ -101,9 +101,14 @@ class StoredBag:
         with damage_of(self.path):
             metadata = self._metadata()
             is_complete = metadata is not None  # which is written last
-            if metadata is None:
-                for path in self._paths(metadata):
-                    _require_bag(path)
+            for path in self._paths(metadata) if metadata is None else ():
+                with open_ordinary(path) as file:
+                    begins = file.read(len(SQLITE_MAGIC))
+                known = (SQLITE_MAGIC, ROS_1_MAGIC, _ZSTD_MAGIC, MCAP0_MAGIC)
+                # One that was cut off may be shorter.
+                if not any(begins[: len(magic)] == magic[: len(begins)] for magic in known):
+                    text = f"{path} is no bag: it begins neither as MCAP nor as SQLite"
+                    raise UsageError(text)
             parts = [s.contents(is_complete=is_complete) for s in self._files(metadata)]
             found: dict[str, Connection] = {}
             for each in (c for part in parts for c in part.connections):
@@ -220,27 +225,10 @@ class StoredBag:
         return copy
 
 
-def _require_bag(path: Path) -> None:
-    """Raise ``UsageError`` for a file that is none of a bag; ``OSError``."""
-    with open_ordinary(path) as file:
-        begins = file.read(len(SQLITE_MAGIC))
-    known = (SQLITE_MAGIC, ROS_1_MAGIC, _ZSTD_MAGIC, MCAP0_MAGIC)
-    # One that was cut off may be shorter.
-    if not any(begins[: len(magic)] == magic[: len(begins)] for magic in known):
-        raise UsageError(f"{path} is no bag: it begins neither as MCAP nor as SQLite")
-
-
 def bag_files(folder: Path) -> list[Path]:
     """Files of bags in a folder."""
     found = (each for each in folder.iterdir() if each.name.endswith(_SUFFIXES))
     return sorted(found, key=lambda each: (len(each.name), each.name))  # bag_2 before bag_10
-
-
-def stored_messages(
-    folder: Path, complain: Callable[[str], object] = lambda _: None, only: str | None = None
-) -> Iterator[Stored]:
-    """As :meth:`StoredBag.messages`."""
-    return StoredBag(folder).messages(complain, only)
 
 
 def faults_of(bag: StoredBag, counts: Mapping[str, int]) -> list[str]:

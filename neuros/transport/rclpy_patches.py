@@ -1,4 +1,4 @@
-"""What NeuROS changes in rclpy and in Fast DDS, each with the reason, and when it can go.
+"""Changes to rclpy and to Fast DDS, each with its reason, and when it can go.
 
 ``tests/integration/test_rclpy_patches.py`` fails as soon as a release does without one of them.
 """

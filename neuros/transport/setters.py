@@ -1,4 +1,4 @@
-"""What ROS's own setters and constructors convert, with the rules that hold for all values.
+"""Conversions of ROS's own setters and constructors, with the rules that hold for all values.
 
 They make arrays of numbers at once: ``numpy.array(values, dtype)`` where their number is fixed
 (which takes ``"12"`` for 12, ``None`` for NaN, and cuts off what is too large), else

@@ -191,7 +191,7 @@ def test_files_and_installed_modules_are_plugins_as_in_json(tmp_path: Path) -> N
     module.__file__ = str(tmp_path / "brain.py")
     plugins = ["brain.py", Path("brain.py"), module]
     nodes = [neuros.Node(f"n{index}", plugin) for index, plugin in enumerate(plugins)]
-    described = neuros.Project(nodes).check_with({}, is_held=True)
+    described = neuros.Project(nodes).described(is_held=True)
     assert [node.plugin for node in described.nodes] == [tmp_path / "brain.py"] * 3
     for plugin in ("json.decoder", json.decoder):
         with pytest.raises(ProjectError, match=r"json/decoder\.py:1:1: declares no hooks"):
@@ -471,7 +471,7 @@ def test_files_that_another_folder_would_lack_are_named(tmp_path: Path) -> None:
         project.to_json("out")
     Path("out").mkdir()
     (tmp_path / "out/world.xml").write_text("<mujoco/>")
-    made = neuros.Project.from_file(project.to_json("out")).check_with({}, is_held=True)
+    made = neuros.Project.from_file(project.to_json("out")).described(is_held=True)
     assert made.node("one").environment["MODEL"] == str(tmp_path / "out/world.xml")
 
 
@@ -634,7 +634,7 @@ def test_the_three_ways_of_the_page_are_the_project_of_the_readme(
     from_json = neuros.Project.from_file(tmp_path)
     made, launched = space["project"], neuros.Project.from_file(tmp_path / "count")
     assert from_json.connections == made.connections == launched.connections
-    described = [each.check_with({}, is_held=True) for each in (from_json, made, launched)]
+    described = [each.described(is_held=True) for each in (from_json, made, launched)]
     ports = [[(node.name, node.inputs, node.outputs) for node in each.nodes] for each in described]
     assert ports[0] == ports[1] == ports[2]
     assert plugin.partition("@")[2].strip() in in_python, "the functions are the same"
@@ -696,8 +696,8 @@ def test_other_warnings_come_at_once_and_point_to_the_program(
 
 
 def test_the_model_of_functions_is_not_in_json() -> None:
-    node: NodeOfModel = talk().check_with({}, is_held=True).node("alice")
+    node: NodeOfModel = talk().described(is_held=True).node("alice")
     assert node.hooks == (begin, add_one)
     assert node.plugin == Path(__file__)
     assert node.plugin_name == "begin, add_one"
-    assert "hooks" not in project_to_json(talk().check_with({}, is_held=True))["nodes"][0]
+    assert "hooks" not in project_to_json(talk().described(is_held=True))["nodes"][0]

@@ -19,7 +19,7 @@ import warnings
 from array import array
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -453,17 +453,6 @@ def spool_file(data: bytes, folder: Path) -> None:
     """What a node writes for the recorder."""
     (folder / "a/spool").mkdir(parents=True)
     (folder / "a/spool/00000000").write_bytes(data)
-    record_spools(folder)
-
-
-HEARD = [asdict(replace(NUMBER, name=f"/heard{place}")) for place in range(2)]
-
-
-@target(lambda: [as_bytes(HEARD)], change_json, change_bytes)
-def listened_topics(data: bytes, folder: Path) -> None:
-    """The recorder's own list, where a node has changed it."""
-    spool(folder, ".listener", [(1, None, number(1))])
-    (folder / ".listener/topics.json").write_bytes(data)
     record_spools(folder)
 
 

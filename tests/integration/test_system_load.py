@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-import pytest
 from launching import Finished, launch
 
 PROJECT = Path(__file__).parent / "back_ends/time"
@@ -42,16 +41,3 @@ def test_without_the_option_nothing_is_written(tmp_path: Path) -> None:
     finished = launch(PROJECT, "--duration", "0.2", cwd=tmp_path)
     assert not (finished.run_folder / "system_load.csv").exists()
     assert "system_load" not in finished.record
-
-
-def test_a_missing_package_is_said_before_anything_starts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from neuros.api import observation
-    from neuros.cli.main import main
-
-    monkeypatch.setattr(observation, "find_spec", lambda name: None)
-    monkeypatch.chdir(tmp_path)
-    assert main(["launch", str(PROJECT), "-m"]) == 4
-    assert "psutil" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []

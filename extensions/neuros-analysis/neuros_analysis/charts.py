@@ -19,7 +19,7 @@ from neuros.project.graph import guarantee, port_names
 from neuros.recording.system_load import FILE_NAME
 from neuros_analysis.comparison import figures_of, labels_of
 from neuros_analysis.graph_picture import Place, lay_out
-from neuros_analysis.review import ReviewedRun, read_load
+from neuros_analysis.review import ReviewedRun, answers_ns, read_load
 
 # Okabe and Ito, Color Universal Design (2008).
 BLUE, ORANGE, GREEN, PURPLE = "#0072B2", "#E69F00", "#009E73", "#CC79A7"
@@ -41,7 +41,6 @@ def colour(index: int) -> str:
 
 def new_figure(height_in: float, width_in: float = _WIDTH_IN) -> Any:
     """An empty ``matplotlib`` figure; no window, no global state."""
-
     return Figure(figsize=(width_in, height_in), dpi=_DPI, layout="constrained")
 
 
@@ -284,7 +283,6 @@ def _draw_route(
     axes: Any, route: Sequence[Place], widths: Mapping[Place, float], shade: str, is_dotted: bool
 ) -> None:
     """A line from the sender's side to the receiver's; its end has the arrow."""
-
     for number, (a, b) in enumerate(itertools.pairwise(route)):
         (x, y), (to_x, to_y) = _at(a), _at(b)
         side = 1 if to_x > x else -1
@@ -326,7 +324,6 @@ def _draw_node(axes: Any, name: str, place: Place, spent: TimeBudget | None) -> 
 def _rectangle(
     axes: Any, x: float, y: float, size: tuple[float, float], face: str, edge: str
 ) -> None:
-
     width, height = size
     axes.add_patch(
         FancyBboxPatch(
@@ -424,7 +421,6 @@ def _draw(axes: Any, run: ReviewedRun, colours: _Colours, start_ns: int, length_
 def _draw_packets(
     axes: Any, run: ReviewedRun, name: str, rows: tuple[int, int], window: tuple[int, int]
 ) -> None:
-
     sender, receiver = rows
     if sender == receiver:
         return
@@ -432,9 +428,11 @@ def _draw_packets(
     away, towards = sender + side * _HALF, receiver - side * _HALF
     flights_ns = run.flights_ns(name)
     flights = _within(flights_ns, window) if flights_ns is not None else None
+    end = run.ends[name]
+    answers = answers_ns(run.traces.get(end.source_node), run.packets[name], end.index)
     for times, ends, shade, dashes in (
         (flights, (away, towards), BLUE, "solid"),
-        (_answers(run, name, window), (towards, away), ORANGE, _DASHES),
+        (_within(answers, window), (towards, away), ORANGE, _DASHES),
     ):
         if times is not None and len(times):
             is_crowd = len(times) > _CROWD
@@ -444,25 +442,6 @@ def _draw_packets(
                 linewidth=0.35 if is_crowd else 0.9, alpha=0.6 if is_crowd else 1,
             )  # fmt: skip
             axes.add_collection(lines)
-
-
-def _answers(run: ReviewedRun, name: str, window: tuple[int, int]) -> Numbers | None:
-    """Start on a packet and arrival of its acknowledgement, in milliseconds, (n, 2).
-
-    Acknowledgements are cumulative: each belongs to the last packet that it counts.
-    """
-    end = run.ends[name]
-    trace = run.traces.get(end.source_node)
-    if trace is None:
-        return None
-    credits = trace.credits[trace.credits[:, 0] == end.index]
-    taken, taken_ns = run.packets[name].taken, run.packets[name].taken_ns
-    places, first = np.unique(taken, return_index=True)
-    found = np.searchsorted(places, credits[:, 1])
-    is_known = found < len(places)
-    is_known[is_known] &= places[found[is_known]] == credits[is_known, 1]
-    times = np.column_stack([taken_ns[first[found[is_known]]], credits[is_known, 2]])
-    return _within(times, window)
 
 
 def _within(times_ns: Numbers, window: tuple[int, int]) -> Numbers:

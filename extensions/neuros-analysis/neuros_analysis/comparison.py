@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from tabulate import tabulate
 
-from neuros.api.run_record import consumed_percent
 from neuros_analysis.review import ReviewedRun
 
 _Figures = dict[tuple[str, int], float | None]
 """Values by name and number of decimals."""
+
+
+def consumed_percent(connection: Mapping[str, Any]) -> float | None:
+    """The share of the packets sent on a connection that were consumed, in per cent."""
+    sent, consumed = connection.get("sent"), connection.get("consumed")
+    return 100 * consumed / sent if sent and consumed is not None else None
 
 
 def labels_of(runs: Sequence[ReviewedRun]) -> list[str]:

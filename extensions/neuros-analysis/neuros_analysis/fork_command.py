@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+from neuros.errors import UsageError
 from neuros.project.suggest import counted
 
 EXIT_DIFFERENT = 6
@@ -47,12 +51,11 @@ def add_fork(fork: argparse.ArgumentParser) -> None:
 
 
 def _fork(options: argparse.Namespace) -> int:
-    from neuros.api.changes import settings_of
     from neuros.cli.environments import signals_interrupt
     from neuros_analysis.forking import fork_run, moment
 
     at_s, _ = moment(options.at)
-    settings = settings_of(options.set)
+    settings = _settings_of(options.set)
     with signals_interrupt([]):
         forked = fork_run(
             options.run.absolute(),
@@ -68,3 +71,25 @@ def _fork(options: argparse.Namespace) -> int:
         return forked.run.exit_code or EXIT_DIFFERENT
     print(f"identical up to {at_s:g} s: {counted(forked.compared, 'packet')}")
     return forked.run.exit_code
+
+
+def _settings_of(texts: Sequence[str]) -> dict[str, Any]:
+    """The values of ``--set PATH=VALUE``.
+
+    Raises:
+        UsageError: for a text without a path or value.
+    """
+    from neuros.api.changes import CHANGES_IN_WORDS
+
+    found: dict[str, Any] = {}
+    for text in texts:
+        path, _, value = text.partition("=")
+        if not (path and value):
+            raise UsageError(f"--set {text}: write PATH=VALUE; {CHANGES_IN_WORDS}")
+        found[path] = value
+        if path.split(".")[2:3] != ["environment"]:
+            try:
+                found[path] = json.loads(value)
+            except ValueError:
+                continue
+    return found

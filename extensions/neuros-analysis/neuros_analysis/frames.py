@@ -7,11 +7,12 @@ data, as the position of a joint, has none.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import pandas as pd
 
+from neuros.api.run_record import PastRun
 from neuros.bag import RecordedTopic
 from neuros.errors import UsageError
 from neuros.recording.columns import (
@@ -24,6 +25,8 @@ from neuros.recording.columns import (
     pixels_of,
 )
 
+_LATENCIES = ("p50", "p90", "p99", "max")
+_SUMMED = ("executing", "waiting", "blocked")
 _MOST_COLUMNS = 100
 _UNITS = {
     "builtin_interfaces/msg/Duration": {"sec": "s", "nanosec": "ns"},
@@ -50,10 +53,27 @@ _UNITS = {
 }
 
 
-def table(rows: Iterable[Mapping[str, Any]], index: str | None = None) -> Any:
-    """A ``pandas.DataFrame`` of rows; ``index``: the column that names them."""
-    made = pd.DataFrame(list(rows))
-    return made if index is None or made.empty else made.set_index(index)
+def connections(run: PastRun) -> Any:
+    """A row for each connection: its figures with those of its latency, without digests."""
+    rows = []
+    for figures in run.connections.values():
+        latency = figures.get("latency_ms") or {}
+        plain = {k: v for k, v in figures.items() if k not in ("latency_ms", "digests", "index")}
+        rows.append(plain | {f"latency_{name}_ms": latency.get(name) for name in _LATENCIES})
+    made = pd.DataFrame(rows)
+    return made if made.empty else made.set_index("connection")
+
+
+def nodes(run: PastRun) -> Any:
+    """A row for each node: seconds by cause, executions, simulated time, results."""
+    rows = {}
+    for name, node in run.nodes.items():
+        spent, hooks = node.get("accounting") or {}, node.get("hooks") or {}
+        row = {f"{kind}_s": sum(spent[kind].values()) for kind in _SUMMED if kind in spent}
+        row |= {"idle_s": spent["idle"], "total_s": spent["total"]} if spent else {}
+        row["executions"] = sum(hook["executions"] for hook in hooks.values())
+        rows[name] = {**row, **node.get("results", {})}
+    return pd.DataFrame.from_dict(rows, orient="index").rename_axis("node")
 
 
 def frame(topic: RecordedTopic, clock: Literal["wall", "sim"]) -> Any:

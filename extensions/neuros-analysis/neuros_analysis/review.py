@@ -88,6 +88,27 @@ def read_trace(folder: Path) -> Trace:
     return Trace(tuple(names), which, starts_ns, ends_ns, arrivals, damaged)
 
 
+def answers_ns(trace: Trace | None, packets: PacketLists, index: int) -> Numbers:
+    """Start on a packet and arrival of its acknowledgement, by their own clocks, (n, 2).
+
+    Acknowledgements are cumulative: each belongs to the last packet that it counts.
+
+    Args:
+        trace: of the sender.
+        packets, index: of the connection.
+    """
+    if trace is None or not len(packets.taken):
+        return np.empty((0, 2), np.int64)
+    credits = trace.credits[trace.credits[:, 0] == index]
+    # The last hook that starts on a packet acknowledges it.
+    places, lasts = np.unique(packets.taken[::-1], return_index=True)
+    taken_ns = packets.taken_ns[::-1][lasts]
+    at = np.minimum(np.searchsorted(places, credits[:, 1]), len(places) - 1)
+    is_known = places[at] == credits[:, 1]
+    found: Numbers = np.column_stack([taken_ns[at], credits[:, 2]])[is_known]
+    return found
+
+
 @dataclass(frozen=True)
 class ReviewedRun(PastRun):
     """A run, with the data for pages and figures.

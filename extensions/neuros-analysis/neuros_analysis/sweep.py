@@ -24,16 +24,16 @@ from tabulate import tabulate
 from neuros.api.live import LiveRun
 from neuros.api.loading import override_texts, value_text
 from neuros.api.plan import time_problems
-from neuros.api.project import Project
+from neuros.api.project import Project, StartOptions
 from neuros.api.request import Request
 from neuros.api.run import Run
-from neuros.api.run_record import consumed_percent
 from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
 from neuros.options import takes
 from neuros.ports import Job, JobResources, Jobs, SweepExecutor, SweepPlan
 from neuros.recording.run_file import RUN_FILE, read_object
 from neuros.registry import AUTO, BACK_ENDS, EXECUTORS
+from neuros_analysis.comparison import consumed_percent
 from neuros_analysis.options import SweepOptions
 
 _PLAN_NAME = "sweep.json"
@@ -69,9 +69,9 @@ class Sweep:
 
     def frame(self) -> Any:
         """A ``pandas.DataFrame``, one row per run."""
-        from neuros_analysis.frames import table
+        import pandas as pd
 
-        return table(self.rows)
+        return pd.DataFrame(self.rows)
 
     def runs(self) -> list[Run]:
         """The runs that have begun, in the order of the rows."""
@@ -282,7 +282,7 @@ def _check_all(project: Project, points: Sequence[Point], request: Request) -> J
     needs: set[JobResources] = set()
     for point in points:
         try:
-            checked = project.check_with(point.settings, point.seed)
+            checked = project.described(StartOptions(set=point.settings, seed=point.seed))
             problems += time_problems(checked, checked.nodes, request.end)
             needs.add(JobResources.of(checked))
         except ProjectError as error:

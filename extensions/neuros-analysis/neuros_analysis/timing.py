@@ -34,7 +34,7 @@ from neuros.project.timing import LEAST_DELAY_NS, MOST_NS, VIRTUAL, Distribution
 from neuros.recording.run_file import RUN_FILE
 from neuros.registry import ran_in_one_process
 from neuros_analysis.options import FITS
-from neuros_analysis.review import Trace, open_for_review, read_trace
+from neuros_analysis.review import Trace, answers_ns, open_for_review, read_trace
 
 MOST_SAMPLES = 1000
 """Of one hook or connection in a file; of more values, quantiles at equal steps."""
@@ -335,17 +335,7 @@ class _Lists:
 
     def answers(self, end: Connection) -> Numbers:
         """Start on a packet and arrival of its acknowledgement, by their own clocks, (n, 2)."""
-        trace, packets = self.traces.get(end.source_node), self._packets[str(end)]
-        if trace is None or not len(packets.taken):
-            return np.empty((0, 2), np.int64)
-        credits = trace.credits[trace.credits[:, 0] == end.index]
-        # The last hook that starts on a packet acknowledges it.
-        places, lasts = np.unique(packets.taken[::-1], return_index=True)
-        taken_ns = packets.taken_ns[::-1][lasts]
-        at = np.minimum(np.searchsorted(places, credits[:, 1]), len(places) - 1)
-        is_known = places[at] == credits[:, 1]
-        found: Numbers = np.column_stack([taken_ns[at], credits[:, 2]])[is_known]
-        return found
+        return answers_ns(self.traces.get(end.source_node), self._packets[str(end)], end.index)
 
     def answers_ns(self, end: Connection) -> Numbers:
         """Nanoseconds of the acknowledgements that found the sender free, (n,)."""

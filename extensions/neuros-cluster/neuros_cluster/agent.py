@@ -288,9 +288,8 @@ class Agent:
             order.options, order.cores, self._pythons.paths, self._reaper, as_asked(os.environ)
         )
         if order.monitors_load:
-            from neuros.api.observation import check_observation, load_monitor
+            from neuros.api.observation import load_monitor
 
-            check_observation(monitors_load=True)
             self._monitor = load_monitor(run_id, self._run, names, is_one_process=False)
             self._monitor.start()
         started = ProcessLauncher(program).start(files, {**order.environment, **own})

@@ -43,11 +43,12 @@ from neuros.options import options_of
 from neuros.ports import JobResources
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import Folders, Node, NodeFile, Project, memory_text
-from neuros.project.paths import NOT_COPIED, files_to_copy
+from neuros.project.paths import NOT_COPIED
 from neuros.project.split import split, translated
 from neuros.project.suggest import did_you_mean
 from neuros_cluster.command import ExportOptions, check_names
 from neuros_cluster.part import parts_to_json
+from neuros_cluster.project_files import files_to_copy
 from neuros_cluster.slurm import slurm_script
 
 ROOT = Path("/neuros")

@@ -6,15 +6,13 @@ message type the first numbers are shown, whose fields its first sample tells.
 
 from __future__ import annotations
 
-import contextlib
 import math
-import select
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from neuros.control import GetStatus, NodeStatus, Watch
+from neuros.api.observation import statuses
 from neuros.control.link import ControlLink
 from neuros.project.dashboard import IMAGES
 
@@ -187,27 +185,18 @@ def observe(
         show: called with a name, the time since the start in seconds, and the new marks.
     """
     names = {(node, port): name for name, (node, port, _) in sources.items()}
-    begin_s = next_s = time.monotonic()
-    with contextlib.closing(link):
-        link.send(Watch())
-        while True:
-            now_s = time.monotonic()
-            if now_s >= next_s:
-                next_s = now_s + _PERIOD_S
-                wanted: dict[str, dict[str, Any]] = {}
-                for node, port, source in sources.values():
-                    wanted.setdefault(node, {})[port] = source.wanted()
-                link.send(GetStatus(wanted))
-            if not select.select([link], [], [], max(0.0, next_s - now_s))[0]:
-                continue
-            messages = link.receive()
-            if messages is None:
-                return
-            for message in messages:
-                if not isinstance(message, NodeStatus):
-                    continue
-                for port, sample in message.samples.items():
-                    name = names[message.node, port]
-                    for row in sample.get("values", ()):
-                        row[0] -= begin_s
-                    show(name, now_s - begin_s, list(sources[name][2].marks(sample)))
+    begin_s = time.monotonic()
+
+    def wanted() -> dict[str, dict[str, Any]]:
+        found: dict[str, dict[str, Any]] = {}
+        for node, port, source in sources.values():
+            found.setdefault(node, {})[port] = source.wanted()
+        return found
+
+    for status in statuses(link, wanted, _PERIOD_S):
+        for port, sample in status.samples.items():
+            name = names[status.node, port]
+            for row in sample.get("values", ()):
+                row[0] -= begin_s
+            marks = sources[name][2].marks(sample)
+            show(name, time.monotonic() - begin_s, list(marks))

@@ -351,7 +351,7 @@ class ProjectEnv(_World, gymnasium.Env[Any, Any]):
         _check_names(options)
         count = check_length(rounds, sim_s)
         loaded = project if isinstance(project, Project) else Project.from_file(project)
-        described = loaded.check_with({}, is_held=True)
+        described = loaded.described(is_held=True)
         self._camera = _camera(described, render_mode, render)
         self.render_mode = render_mode
         self.metadata = {"render_modes": []}
@@ -486,7 +486,7 @@ class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
         _check_steps(max_episode_steps)
         check_length(rounds, sim_s)
         loaded, self._copied = _with_copies(project, num_envs)
-        described = loaded.check_with({}, is_held=True)
+        described = loaded.described(is_held=True)
         self.num_envs = described.node(self._copied[0]).copies or 1
         self._masked = _inputs_behind(described, reset)
         for type_ in {_port(described, name).type for name in self._masked}:
@@ -627,7 +627,7 @@ def _with_copies(
     loaded = project if isinstance(project, Project) else Project.from_file(project)
     found = {
         node.name: node.copies
-        for node in loaded.check_with({}, is_held=True).nodes
+        for node in loaded.described(is_held=True).nodes
         if node.copies is not None
     }
     if not found:

@@ -23,7 +23,6 @@ from neuros.project.suggest import counted
 
 if TYPE_CHECKING:
     from neuros.api.run_record import PastRun
-    from neuros.bag import RecordedTopic
     from neuros.hooks import HookSpec
     from neuros_analysis.replay.node_replay import NodeVerdict
     from neuros_analysis.replay.replayed_node import ReplayedNode
@@ -166,15 +165,31 @@ def _replay(options: argparse.Namespace) -> int:
                 "replay: --topic publishes; --node, --jobs and --output run nodes: choose one"
             )
         return _publish(options)
+    from neuros_analysis.replay.node_replay import replay_of
     from neuros_analysis.replay.recorded_node import recorded_run, require_end
 
     run = recorded_run(Path(options.run).absolute())
     require_end(run)
-    if len(options.nodes) == 1 and options.format != JSON:
-        return _replay_node(options, run)
-    if has_debugger:
-        raise UsageError("replay: --pdb and --debugpy have the terminal: leave --format json out")
-    return _replay_nodes(options, run)
+    if len(options.nodes) > 1 or not options.nodes or options.format == JSON:
+        if has_debugger:
+            text = "replay: --pdb and --debugpy have the terminal: leave --format json out"
+            raise UsageError(text)
+        return _replay_nodes(options, run)
+    replay = replay_of(run, options.nodes[0])
+    python, ended = replay.make_python()
+    if ended:
+        return ended
+    arguments = ["--pdb"] if options.pdb else []
+    arguments += ["--debugpy", str(options.debugpy)] if options.debugpy is not None else []
+    arguments += [] if options.output else ["--remove"]
+    folder = _folder(options.output)
+    command, environment = replay.start(python, folder, arguments)
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os.chdir(folder)
+    # This process becomes that of the node, which has the terminal, for debuggers.
+    os.execve(command[0], command, environment)
+    return 0
 
 
 def _publish(options: argparse.Namespace) -> int:
@@ -194,7 +209,18 @@ def _publish(options: argparse.Namespace) -> int:
     with open_bag(options.run) as bag:
         if bag.damage is not None:
             print(f"neuros: {bag.damage}", file=sys.stderr)
-        chosen = [t for t in bag.chosen(options.replay_topics) if _can_publish(t, options)]
+        chosen = []
+        for topic in bag.chosen(options.replay_topics):
+            try:
+                why = topic.misfit
+            except EnvironmentFault as fault:
+                why = str(fault)
+            if not why:
+                chosen.append(topic)
+            elif topic.name in options.replay_topics:  # it was named by itself
+                raise EnvironmentFault(f"replay: {topic.name} cannot be published: {why}")
+            else:
+                print(f"neuros: {topic.name} is not published: {why}", file=sys.stderr)
         packets = sorted(
             (packet.log_time_ns, topic.name, packet.data)
             for topic in chosen
@@ -210,23 +236,6 @@ def _publish(options: argparse.Namespace) -> int:
         )
     print(f"{sent} packets on {len(chosen)} topics")
     return 0
-
-
-def _can_publish(topic: RecordedTopic, options: argparse.Namespace) -> bool:
-    """Whether ROS here has the type of a topic; one that was named by itself is required.
-
-    Raises:
-        EnvironmentFault: if it is required.
-    """
-    try:
-        why = topic.misfit
-    except EnvironmentFault as fault:
-        why = str(fault)
-    if why and topic.name in options.replay_topics:
-        raise EnvironmentFault(f"replay: {topic.name} cannot be published: {why}")
-    if why:
-        print(f"neuros: {topic.name} is not published: {why}", file=sys.stderr)
-    return not why
 
 
 def _replay_bag(options: argparse.Namespace) -> int:
@@ -268,37 +277,18 @@ def _replay_bag(options: argparse.Namespace) -> int:
     return 0
 
 
-def _replay_node(options: argparse.Namespace, run: PastRun) -> int:
-    """Become the process in which the node is replayed; returns only if that is interrupted.
-
-    The node runs in this very process (``exec``), which becomes one like those of a run: with the
-    Python, the environment and the script of the node, and with the terminal, for debuggers.
-
-    Raises:
-        UsageError: if the node or the recording is not there.
-        EnvironmentFault: if the node's Python cannot be made.
-    """
-    from neuros_analysis.replay.node_replay import replay_of
-
-    replay = replay_of(run, options.nodes[0])
-    python, ended = replay.make_python()
-    if ended:
-        return ended
-    arguments = ["--pdb"] if options.pdb else []
-    arguments += ["--debugpy", str(options.debugpy)] if options.debugpy is not None else []
-    arguments += [] if options.output else ["--remove"]
-    replay.start(python, _folder(options.output), arguments).become()
-    return 0
-
-
 def _replay_nodes(options: argparse.Namespace, run: PastRun) -> int:
     """Replay nodes in processes of their own, and show a table.
 
     Raises:
         UsageError, EnvironmentFault: if some of them cannot be replayed.
     """
+    from tabulate import tabulate
+
     from neuros.backends.node_command import usable_cores
     from neuros.cli.environments import signals_interrupt
+    from neuros_analysis.replay.node_replay import IDENTICAL
+    from neuros_analysis.replay.recorded_node import is_cut_off
     from neuros_analysis.replay.whole_run import Replays, replays_of
 
     replays = replays_of(run, options.nodes or [*run.nodes])
@@ -325,23 +315,14 @@ def _replay_nodes(options: argparse.Namespace, run: PastRun) -> int:
     finally:
         if options.output is None:
             shutil.rmtree(folder, ignore_errors=True)
-    _show(verdicts, run, options)
-    found = {verdict.verdict for verdict in verdicts}
-    return next((code for verdict, code in _EXIT_CODES.items() if verdict in found), 0)
-
-
-def _show(verdicts: Sequence[NodeVerdict], run: PastRun, options: argparse.Namespace) -> None:
-    from neuros_analysis.replay.node_replay import IDENTICAL
-    from neuros_analysis.replay.recorded_node import is_cut_off
-
     notes = [f"{each.node}: {note}" for each in verdicts for note in each.notes]
     if is_cut_off(run):
         notes.insert(0, "the launcher of the run was killed: it is replayed as far as it was kept")
+    found = {verdict.verdict for verdict in verdicts}
+    code = next((code for verdict, code in _EXIT_CODES.items() if verdict in found), 0)
     if options.format == JSON:
         print_json({"nodes": verdicts, "notes": notes})
-        return
-    from tabulate import tabulate
-
+        return code
     for note in notes:
         print(f"note: {note}")
     rows = [
@@ -361,6 +342,7 @@ def _show(verdicts: Sequence[NodeVerdict], run: PastRun, options: argparse.Names
     others = [f"{each.node} {each.verdict}" for each in verdicts if each.verdict != IDENTICAL]
     result = ", ".join(others) or f"identical: {counted(len(verdicts), 'node')}"
     print(f"\n{result}; {packets}; {hooks} of hooks")
+    return code
 
 
 def _replayed(options: argparse.Namespace) -> int:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from neuros.api.loading import workspaces_of
 from neuros.api.run_record import PastRun
 from neuros.backends.node_command import (
     node_environment,
@@ -24,9 +25,10 @@ from neuros.backends.node_command import (
     with_messages,
 )
 from neuros.backends.pythons import Pythons
-from neuros.cli.environments import make_shown_environments, require_messages
+from neuros.cli.environments import build_messages, make_shown_environments
 from neuros.distribution import WORKSPACE, python_command
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.messages.needed import Messages
 from neuros.messages.workspace import message_cache
 from neuros.node.keeping import RESTORED
 from neuros.ordinary_files import write_whole
@@ -105,8 +107,10 @@ class NodeReplay:
             raise not_here(self.run, self.name, fault) if is_container else fault from fault
         return pythons.paths.get(self.name, Path(sys.executable)), ended
 
-    def start(self, python: Path, folder: Path, options: Sequence[str] = ()) -> ReplayProcess:
-        """What to start in a folder, which takes the place of the run folder."""
+    def start(
+        self, python: Path, folder: Path, options: Sequence[str] = ()
+    ) -> tuple[list[str], dict[str, str]]:
+        """Arguments and environment of the process; ``folder`` takes the place of the run's."""
         own = folder / self.name
         if self.file.restored:
             shutil.copytree(self.run.folder / self.name / RESTORED, own / RESTORED)
@@ -126,23 +130,7 @@ class NodeReplay:
         )
         arguments = start_arguments(command, [file])
         arguments[0] = shutil.which(arguments[0]) or arguments[0]
-        return ReplayProcess(arguments, environment, folder)
-
-
-@dataclass(frozen=True)
-class ReplayProcess:
-    """Arguments, environment and current folder of a process."""
-
-    arguments: list[str]
-    environment: dict[str, str]
-    folder: Path
-
-    def become(self) -> None:
-        """Replace this process by it."""
-        for stream in (sys.stdout, sys.stderr):
-            stream.flush()
-        os.chdir(self.folder)
-        os.execve(self.arguments[0], self.arguments, self.environment)
+        return arguments, environment
 
 
 def replay_of(run: PastRun, name: str, *, is_strict: bool = False) -> NodeReplay:
@@ -156,10 +144,32 @@ def replay_of(run: PastRun, name: str, *, is_strict: bool = False) -> NodeReplay
         EnvironmentFault: if a file is damaged, or message packages are missing.
     """
     file = as_on_this_machine(run, recorded_node(run, name), WORKSPACE, message_cache(os.environ))
-    require_messages(file)
+    _require_messages(file)
     if not (file.node.module or file.node.plugin.is_file()):
         raise UsageError(f"replay: the plugin of '{name}' is gone: {file.node.plugin}")
     recorded = RecordedNode(run, file)
     if is_strict:
         recorded.check()
     return NodeReplay(run, file)
+
+
+def _require_messages(file: NodeFile) -> None:
+    """Build the message packages of a recorded node anew if they were removed.
+
+    Raises:
+        UsageError: if the files of a removed package have changed since the run.
+        EnvironmentFault: if a package cannot be built.
+    """
+    missing = [python for python in file.messages if not python.is_dir()]
+    if not missing:
+        return
+    workspaces = workspaces_of(file.folders.project)
+    names = {python: python.parent.name.rpartition("-")[0] for python in missing}
+    messages = Messages(workspaces, names.values())
+    for python in missing:
+        if python not in messages.paths:
+            raise UsageError(
+                f"replay: message package '{names[python]}' has changed since the run, and what was"
+                f" built for that is gone: {python.parent}"
+            )
+    build_messages(messages)

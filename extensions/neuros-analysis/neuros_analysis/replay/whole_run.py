@@ -77,14 +77,14 @@ class Replays:
     def _replay(self, replay: NodeReplay, python: Path) -> NodeVerdict:
         own = self._folder / replay.name
         file = own / VERDICT
-        started = replay.start(python, self._folder, ["--verdict", str(file)])
+        command, environment = replay.start(python, self._folder, ["--verdict", str(file)])
         with (own / LOG).open("wb") as log:
             if self._is_over:
                 return NodeVerdict(replay.name, FAILED)
             process = self._processes[replay.name] = subprocess.Popen(
-                started.arguments,
-                env=started.environment,
-                cwd=started.folder,
+                command,
+                env=environment,
+                cwd=self._folder,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=subprocess.STDOUT,
