@@ -48,6 +48,7 @@ BY_NAME = {
         "api/test_session_forks.py",
         "api/test_session_resets.py",
         "api/test_stepped_sessions.py",
+        "extensions/neuros-analysis/tests/test_packs.py",
         "extensions/neuros-analysis/tests/test_report.py",
         "extensions/neuros-analysis/tests/test_spike_trains.py",
         "extensions/neuros-analysis/tests/test_sweep.py",

@@ -13,3 +13,4 @@ TIMING = Subcommand(
 SWEEP = Subcommand(
     "neuros_analysis.command", "run a project with many values and seeds, and make one table"
 )
+PACK = Subcommand("neuros_analysis.packs", "write a run and all that repeats it into one file")
