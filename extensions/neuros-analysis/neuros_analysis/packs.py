@@ -56,11 +56,11 @@ def pack(run: str | os.PathLike[str], file: str | os.PathLike[str], *, wheels: b
         ProjectError: the folder of the project has files that cannot be copied.
         EnvironmentFault: the file cannot be written, or pip cannot fetch a package.
     """
-    from neuros.api.forking import repeated, why_not_repeated
     from neuros.api.project import StartOptions
     from neuros.api.run_record import open_run
     from neuros.project.paths import files_to_copy
     from neuros.project.repeatable import why_not_repeatable
+    from neuros_analysis.forking import repeated, why_not_repeated
 
     folder, target = Path(run).absolute(), Path(file).absolute()
     if target.exists():
@@ -325,8 +325,8 @@ def _surroundings(folder: Path) -> dict[str, str]:
 
 def _main() -> None:
     """Run the project of the unpacked pack in a folder; in the environment of the pack."""
-    from neuros.api.forking import repeated
     from neuros.api.run_record import open_run
+    from neuros_analysis.forking import repeated
 
     folder = Path(sys.argv[1])
     record = open_run(folder / "run").record
