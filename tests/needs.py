@@ -82,8 +82,6 @@ NEEDS = {
     "slurmctld": Need(_daemon("slurmctld"), ("slurmctld",)),
     "slurmd": Need(_daemon("slurmd"), ("slurmd",)),
     "sbatch": Need(_program("sbatch"), ("slurm-client",)),
-    "ch-run": Need(_program("ch-run"), ("charliecloud-runtime",)),
-    "ch-convert": Need(_program("ch-convert"), ("charliecloud-builders",)),
     "docker": Need(_program("docker"), ("docker.io",)),
     "docker-compose": Need(_program("docker-compose"), ("docker-compose",)),
     "sshd": Need(_daemon("sshd"), ("openssh-server",)),

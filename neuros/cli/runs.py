@@ -6,10 +6,12 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from neuros.cli.common import JSON, add_format, print_json
 from neuros.errors import UsageError
 from neuros.project.suggest import counted
+from neuros.registry import NAMES
 
 EXIT_DIFFERENT = 1
 EXIT_UNKNOWN = 2
@@ -23,23 +25,39 @@ def add_verify(verify: argparse.ArgumentParser) -> None:
     verify.description = (
         "Say whether two runs carried the same packets. If not, name the first difference:"
         " connection, packet and, if both runs were recorded, field. For a run that was started"
-        " in parts, name a folder that holds the run folders of all parts."
+        " in parts, name a folder that holds the run folders of all parts. Of a file of"
+        " `neuros pack`: run the project again as it was, and compare it with the packed run. That"
+        " executes what is in the file."
     )
     verify.epilog = (
         "exit codes: 0 identical, 1 different, 2 nothing to compare, 6 the same packets were sent,"
         " but hooks took others of them"
     )
-    verify.add_argument("run_a", metavar="RUN_A", type=Path, help="a run folder")
-    verify.add_argument("run_b", metavar="RUN_B", type=Path, help="another one")
+    verify.add_argument(
+        "run_a", metavar="RUN_A", type=Path, help="a run folder, or a file of `neuros pack`"
+    )
+    verify.add_argument("run_b", metavar="RUN_B", type=Path, nargs="?", help="another run folder")
     add_format(verify)
     verify.set_defaults(command=_verify)
 
 
 def _verify(options: argparse.Namespace) -> int:
+    if options.run_b is not None:
+        return _compare(options.run_a, options.run_b, options.format)
+    if not options.run_a.is_file():
+        raise UsageError(
+            f"verify {options.run_a}: name another run folder after it, or a file of `neuros pack`"
+        )
+    with TemporaryDirectory(prefix="neuros-verify-") as folder:
+        packed, again = NAMES.load("packs").run_again(options.run_a, Path(folder))
+        return _compare(packed, again, options.format)
+
+
+def _compare(run_a: Path, run_b: Path, form: str) -> int:
     from neuros.api.run_record import open_whole
     from neuros.api.verify import RecordedPackets, compare
 
-    a, b = open_whole(options.run_a), open_whole(options.run_b)
+    a, b = open_whole(run_a), open_whole(run_b)
     recorded = RecordedPackets()
     verdict = compare(a, b, recorded)
     remarks = [*recorded.remarks, *verdict.remarks]
@@ -54,7 +72,7 @@ def _verify(options: argparse.Namespace) -> int:
         what = f"{packets}; {_were(taken)} consumed differently"
     if verdict.not_compared and exit_code in (0, EXIT_CONSUMED):
         what += f"; {_were(verdict.not_compared)} not compared, or not whole"
-    if options.format == JSON:
+    if form == JSON:
         print_json(
             {
                 "verdict": result,

@@ -67,7 +67,7 @@ def test_a_name_that_is_none_is_refused_with_all_that_there_are() -> None:
     assert refused.returncode == 2
     assert refused.stderr == (
         "neuros: back end 'nic': choose one of auto, docker, process, in-process, nice,"
-        " charliecloud (did you mean 'nice'?)\n"
+        " apptainer (did you mean 'nice'?)\n"
     )
 
 

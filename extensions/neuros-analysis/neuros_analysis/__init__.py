@@ -13,6 +13,7 @@ TIMING = Subcommand(
 SWEEP = Subcommand(
     "neuros_analysis.command", "run a project with many values and seeds, and make one table"
 )
+PACK = Subcommand("neuros_analysis.packs", "write a run and all that repeats it into one file")
 REPLAY = Subcommand(
     "neuros_analysis.replay.command",
     "run one node of a recorded run again, or publish recorded topics",

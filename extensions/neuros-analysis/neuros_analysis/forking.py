@@ -108,21 +108,24 @@ def fork_run(
     return Fork(run, compared, difference)
 
 
-def _again(
-    record: Mapping[str, Any], folder: Path, at: str, options: Mapping[str, Any]
-) -> tuple[Project, StartOptions]:
-    """The project of a run, and the options with which it began.
+def repeated(
+    record: Mapping[str, Any], folder: Path, options: Mapping[str, Any]
+) -> tuple[Project, dict[str, Any]]:
+    """The project of a run, and the arguments of :meth:`Project.start` with which it began.
+
+    Args:
+        record: the ``run.json`` of the run in ``folder``.
+        options: take the place of those of the run where they are not ``None``.
 
     Raises:
-        UsageError: with all reasons why it cannot be forked.
+        UsageError: if the run cannot be started again from its project file.
     """
-    told = json.dumps(record["expanded_project"])
     file = Path(record["file"])
-    if record["backend"] == LOCAL or SESSION in told:
+    if record["backend"] == LOCAL or SESSION in json.dumps(record["expanded_project"]):
         raise UsageError(f"{folder} is the run of a session: fork that in its program (fork())")
     if record.get("fork", {}).get("set"):
         raise UsageError(
-            f"{folder}: it is a fork with settings itself: fork the run that it began with,"
+            f"{folder}: it is a fork with settings itself: name the run that it began with,"
             f" {record['fork']['run']}"
         )
     if not file.is_file():
@@ -138,26 +141,44 @@ def _again(
     }
     given |= {"restore": restored, "digests": given.get("packet_log") != "0"}
     given |= {key: value for key, value in options.items() if value is not None}
+    return Project.from_file(file), given
+
+
+def why_not_repeated(
+    described: Described, record: Mapping[str, Any], options: Mapping[str, Any]
+) -> Iterator[str]:
+    """Reasons why a project with the options of a run is not that of the run, or not all of it."""
+    if json.dumps(project_to_json(described), sort_keys=True) != json.dumps(
+        record["expanded_project"], sort_keys=True
+    ):
+        yield f"{record['file']} was changed after the run: it describes another project now"
+    if options.get("nodes") or record["options"].get("network"):
+        yield "its nodes ran at several places: a fork and a pack have all of them here"
+    if record["exit_code"] in _INTERRUPTED and options.get("duration") is None:
+        yield f"{record['reason']}: give --duration with simulated seconds (30sim)"
+
+
+def _again(
+    record: Mapping[str, Any], folder: Path, at: str, options: Mapping[str, Any]
+) -> tuple[Project, StartOptions]:
+    """The project of a run, and the options with which it began.
+
+    Raises:
+        UsageError: with all reasons why it cannot be forked.
+    """
+    project, given = repeated(record, folder, options)
     chosen = StartOptions(**given)
-    project = Project.from_file(file)
     described = project.described(chosen)
     at_s, is_simulated = moment(at)
     why = why_not_repeatable(described)
     if described.is_virtual == is_simulated:
         clock = ("simulated seconds, as in 12.4sim", "seconds of virtual time, as in 12.4")
         why.append(f"--at {at}: it is in {described.time} time: give {clock[is_simulated]}")
-    if json.dumps(project_to_json(described), sort_keys=True) != json.dumps(
-        record["expanded_project"], sort_keys=True
-    ):
-        why.insert(0, f"{file} was changed after the run: it describes another project now")
-    if chosen.nodes or record["options"].get("network"):
-        why.append("its nodes ran at several places: a fork runs all of them here")
+    why += why_not_repeated(described, record, given)
     if not described.is_virtual:
         why += _time_problems(described, record, chosen, at_s)
     elif at_s > (record.get("virtual_s") or 0.0) - _FINE:
         why.append(f"it ended at {record.get('virtual_s') or 0:g} s of its clock: fork it before")
-    if record["exit_code"] in _INTERRUPTED and chosen.duration is None:
-        why.append(f"{record['reason']}: give --duration with simulated seconds (30sim)")
     if why:
         raise UsageError("\n".join([f"{folder} cannot be forked:", *(f"  {each}" for each in why)]))
     return project, chosen

@@ -39,6 +39,11 @@ class SweepOptions:
         help="set a key of the project, as launch does, to each of these values; commas separate"
         " them, but not within brackets or quotes",
     )
+    points: Sequence[Mapping[str, Any]] = option(
+        default=(),
+        help="values by path for each run, beside those of set and in place of all combinations:"
+        " the runs that an optimiser asks for",
+    )
     seeds: Iterable[int] = option(
         "--seeds",
         parse=_seeds,

@@ -13,7 +13,7 @@ import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -108,8 +108,7 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
     earlier calls.
 
     ``set`` has a value or a list of values for each path of ``--set``. Runs have the other
-    options of
-    :meth:`~neuros.api.project.Project.run`.
+    options of :meth:`~neuros.api.project.Project.run`. With ``points`` the rows are in their order.
 
     Raises:
         ProjectError: if the project is not valid with all values; nothing has been run then.
@@ -120,7 +119,10 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
     if not isinstance(project, Project):
         project = Project.from_file(project)
     values = _values(options.set)
-    points = points_of(values, [int(seed) for seed in options.seeds], options.repeat)
+    seeds = [int(seed) for seed in options.seeds]
+    points = points_of(values, seeds, options.repeat)
+    if options.points:
+        points = [*_asked(options.points, values, seeds, options.repeat)]
     if options.jobs is not None and options.jobs < 1:
         raise UsageError(f"jobs {options.jobs}: give 1 or more")
     request = Request(**{name: getattr(options, name) for name in _OF_EACH_RUN})
@@ -464,6 +466,25 @@ def points_of(
         for seed in (seeds or (None,))
         for number in repeats
     ]
+
+
+def _asked(
+    asked: Sequence[Mapping[str, Any]],
+    values: Mapping[str, Sequence[Any]],
+    seeds: Sequence[int],
+    repeat: int,
+) -> Iterator[Point]:
+    """The points that an optimiser asks for; one that it asks for again is a repetition."""
+    paths = set(asked[0])
+    known: list[Mapping[str, Any]] = []
+    for number, settings in enumerate(asked, 1):
+        if set(settings) != paths:
+            raise UsageError(f"points: number {number} has other paths than the first one")
+        before = known.count(settings) * repeat
+        known.append(settings)
+        for point in points_of({**values, **{k: [v] for k, v in settings.items()}}, seeds, repeat):
+            again = (point.repeat or 1) + before
+            yield replace(point, repeat=again) if before else point
 
 
 def short_names(paths: Sequence[str]) -> dict[str, str]:

@@ -252,7 +252,7 @@ def test_a_fork_that_was_changed_cannot_be_executed_again_by_its_project(
     fork(run, tmp_path / "first", "--at", "0.3sim", *changed)
     done = fork(tmp_path / "first", tmp_path / "second", "--at", "0.6sim")
     assert done.returncode == 2, done.stdout + done.stderr
-    assert "it is a fork with settings itself: fork the run that it began with" in done.stderr
+    assert "it is a fork with settings itself: name the run that it began with" in done.stderr
 
 
 def test_a_plugin_that_was_changed_meanwhile_is_found_out(own: Path, tmp_path: Path) -> None:

@@ -72,6 +72,26 @@ def test_a_sweep_is_a_table_whatever_becomes_of_its_runs_and_can_be_gone_on_with
     assert [row["exit_code"] for row in made["rows"]] == [0, 1]
 
 
+def test_an_optimiser_asks_for_points_and_is_told_their_rows(tmp_path: Path) -> None:
+    project = neuros.Project.from_file(dice(tmp_path, COUNTER.replace("== 13", "> 6")))
+    asked = [{FACES: "1"}, {FACES: "999999999"}, {FACES: "1"}]
+    runs = neuros.sweep(project, points=asked, backend="in-process", output="first")
+    assert [(row["FACES"], row["exit_code"]) for row in runs.rows] == [
+        ("1", 0),
+        ("999999999", 1),
+        ("1", 0),
+    ]
+    assert [row.get("repeat") for row in runs.rows] == [None, None, 2]
+    again = neuros.sweep(project, points=asked[:1], backend="in-process", output="first")
+    assert again.rows == runs.rows[:1], "it was not run again"
+
+
+def test_points_have_the_same_paths(tmp_path: Path) -> None:
+    project = neuros.Project.from_file(dice(tmp_path, COUNTER))
+    with pytest.raises(UsageError, match="points: number 2 has other paths than the first one"):
+        neuros.sweep(project, points=[{FACES: 1}, {}], backend="in-process")
+
+
 def test_from_python_it_is_a_frame(tmp_path: Path) -> None:
     seeds = np.array([5])
     made = neuros.sweep(dice(tmp_path), set={FACES: [1]}, seeds=seeds, backend="in-process")

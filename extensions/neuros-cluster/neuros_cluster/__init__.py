@@ -1,4 +1,4 @@
-"""Runs on other machines: by ssh, on Slurm, Dask and Kubernetes, in Compose and Charliecloud."""
+"""Runs on other machines: by ssh, on Slurm, Dask and Kubernetes, in Compose and Apptainer."""
 
 from neuros.ports import Subcommand
 

@@ -164,7 +164,7 @@ class Agent:
                     self._pump.timeout_s = message.timeout_s
                     self._begin_to_place(message)
                 case Chunk():
-                    write_chunk(self._store.received, message)
+                    write_chunk(self._run or self._store.received, message)
                 case Sent():
                     self._place()
                 case Prepare(nodes):
@@ -246,18 +246,12 @@ class Agent:
         assert self._run is not None
         files = node_files_from_json(order.nodes)
         names = [file.node.name for file in files]
-        given = {**order.files, **{f"{f.node.name}/node.json": node_file_text(f) for f in files}}
-        for name, text in given.items():
-            path = self._run / name
-            path.parent.mkdir(exist_ok=True)
-            path.touch(0o600)  # the files hold keys
-            path.write_text(text, "utf-8")
-        machine = order.machine
-        for name, data in order.restored.items():
-            path = self._run / name
-            path.parent.mkdir(exist_ok=True)
-            path.write_bytes(data)
-        self._follower = Follower(self._run, names, machine, {*given, *order.restored})
+        for file in files:
+            (self._run / file.node.name).mkdir(exist_ok=True)
+            (self._run / file.node.name / "node.json").write_text(node_file_text(file), "utf-8")
+        given = [path for path in self._run.rglob("*") if path.is_file()]
+        known = {path.relative_to(self._run).as_posix() for path in given}
+        self._follower = Follower(self._run, names, order.machine, known)
         listener = UnixListener(self._run)
         # The first digits are those of the launcher's run; to reapers it is another run.
         run_id = order.run[:8] + os.urandom(4).hex()

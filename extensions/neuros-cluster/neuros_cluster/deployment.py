@@ -11,7 +11,7 @@ import json
 import re
 import socket
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -286,14 +286,20 @@ class _Launcher:
                 self._machines.project.name,
                 side.host.name,
                 tuple(node_file_to_json(self._machines.node_there(f, side)) for f in files),
-                _texts(run),
                 {**environment, _PEERS: ";".join(dict.fromkeys(others))},
                 tuple(self._program.options),
                 {name: c for name, c in self._program.cores.items() if name in side.nodes},
                 self._machines.monitors_load,
-                dict(_restored(run, files)),
             ),
             run,
+            [
+                *run.glob("*.json"),
+                *(
+                    run / file.node.name / RESTORED / f"{name}{SUFFIX}"
+                    for file in files
+                    for name in file.restored
+                ),
+            ],
             lambda: connect(environment[CONTROL_VARIABLE]),
         )
 
@@ -344,31 +350,6 @@ def _bring_home(side: Side, is_enough: Callable[[], bool]) -> Sequence[str]:
 def _renamed(text: str, there: str, here: str) -> str:
     """Replace a path there by the one here, except after a colon (``host:path``)."""
     return re.sub(rf"(?<![\w/.:]){re.escape(there)}\b", lambda _: here, text)
-
-
-def _texts(run: Path) -> dict[str, str]:
-    """The JSON files of a run folder before the nodes start, by name.
-
-    Raises:
-        EnvironmentFault: a file cannot be read.
-    """
-    found = {}
-    for path in run.glob("*.json"):
-        try:
-            found[path.name] = path.read_text("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            why = getattr(error, "strerror", None) or error
-            raise EnvironmentFault(
-                f"{path} cannot be read, and other machines need it: {why}"
-            ) from error
-    return found
-
-
-def _restored(run: Path, files: Iterable[NodeFile]) -> Iterator[tuple[str, bytes]]:
-    for file in files:
-        for name in file.restored:
-            path = Path(file.node.name, RESTORED, f"{name}{SUFFIX}")
-            yield path.as_posix(), (run / path).read_bytes()
 
 
 def _package(python: Path) -> str:

@@ -49,7 +49,7 @@ from neuros.project.suggest import did_you_mean
 from neuros_cluster.command import ExportOptions, check_names
 from neuros_cluster.part import parts_to_json
 from neuros_cluster.project_files import files_to_copy
-from neuros_cluster.slurm import slurm_script
+from neuros_cluster.slurm import filled, slurm_script
 
 ROOT = Path("/neuros")
 FOLDERS = Folders(project=ROOT / "project", workspace=ROOT / "lib/workspace", run=ROOT / "runs")
@@ -62,25 +62,10 @@ _MOST_PIDS = 4096
 _OF_CONTAINERS = ("peers", "peer_timeout", "host_network", "registry", "volume_claim")
 _OF_SLURM = ("place", "spread")
 _STOP_S = 15  # besides the time of finalise hooks: peers exchange their counts
-_PROBE_S = 10
 _LONGEST_LABEL = 63  # of DNS
 _MOST_MACHINES = 65_536  # no cluster has more
 # A dependency of a node's launcher that images of nodes lack: pure Python, in one folder.
 _VENDORED = "tabulate"
-
-_ENTRYPOINT = json.dumps(
-    python_command("neuros.cli", "part", str(ROOT / NODES_FILE), python="python3")
-)
-_DOCKERFILE = f"""\
-# The image of a container, and on top of it NeuROS and the project. It takes no network.
-ARG BASE
-FROM ${{{{BASE}}}}
-COPY image {ROOT}
-ENV HOME=/tmp XDG_CACHE_HOME=/tmp/.cache PYTHONUNBUFFERED=1 PYTHONPATH={{path}} {{threads}}
-USER 1000:1000
-WORKDIR {ROOT}
-ENTRYPOINT {_ENTRYPOINT}
-"""
 
 
 @dataclass(frozen=True)
@@ -179,7 +164,9 @@ class Export:
         messages = [str(_MESSAGES / python.parent.name / "python") for python in self._messages]
         threads = " ".join(f"{variable}=1" for variable in THREAD_VARIABLES)
         path = os.pathsep.join([*messages, str(_LIBRARY)])
-        return _DOCKERFILE.format(path=path, threads=threads)
+        start = python_command("neuros.cli", "part", str(ROOT / NODES_FILE), python="python3")
+        entrypoint = json.dumps(start)
+        return filled("Dockerfile", path=path, threads=threads, entrypoint=entrypoint)
 
     def write(self) -> Path:
         """Write the folder; returns the file for the engine.
@@ -331,25 +318,22 @@ def _compose(export: Export) -> list[dict[str, Any]]:
     return [{"services": {p.name: _compose_service(export, p) for p in export.parts(str)}}]
 
 
+def _document(template: str, **values: object) -> Any:
+    return yaml.safe_load(filled(template, **{k: json.dumps(v) for k, v in values.items()}))
+
+
 def _compose_service(export: Export, part: Part) -> dict[str, Any]:
     resources, access = part.node.resources, part.node.access
-    service: dict[str, Any] = {
-        "image": part.image,
-        "build": {"context": ".", "args": {"BASE": part.base}},
-        "command": list(part.command),
-        "init": True,
-        "read_only": True,
-        "cap_drop": ["ALL"],
-        "stop_grace_period": f"{_stop_s(part)}s",
-        "healthcheck": {"test": ["CMD", *_is_up(part, "$$")], "interval": f"{_PROBE_S}s"},
-        "restart": "no",
-        "tmpfs": ["/tmp:exec,mode=1777"],
-        # The exporting user can read and remove the files of nodes.
-        "user": f"${{RUN_AS:-{os.getuid()}:{os.getgid()}}}",
-        "security_opt": ["no-new-privileges:true"],
-        "pids_limit": resources.pids or _MOST_PIDS,
-        "volumes": [f"./{NODES_FILE}:{ROOT / NODES_FILE}:ro", f"./runs:{FOLDERS.run}"],
-    }
+    service: dict[str, Any] = _document(
+        "compose.yaml",
+        image=part.image,
+        base=part.base,
+        command=list(part.command),
+        stop=f"{_stop_s(part)}s",
+        probe=["CMD", *_is_up(part, "$$")],
+        user=f"${{RUN_AS:-{os.getuid()}:{os.getgid()}}}",
+        pids=resources.pids or _MOST_PIDS,
+    )
     if resources.mem_bytes is not None:
         memory = memory_text(resources.mem_bytes)
         service |= {"mem_limit": memory, "memswap_limit": memory}
@@ -386,19 +370,7 @@ def _kubernetes(export: Export) -> list[dict[str, Any]]:
     content = json.dumps(parts_to_json(export.project, export.files), indent=2) + "\n"
     hosts = {name: f"{export.name}-{name}-0.{export.name}" for name in export.names.values()}
     return [
-        {
-            "apiVersion": "v1",
-            "kind": "ConfigMap",
-            "metadata": {"name": export.name, "labels": app},
-            "data": {NODES_FILE: content},
-        },
-        {
-            "apiVersion": "v1",
-            "kind": "Service",
-            "metadata": {"name": export.name, "labels": app},
-            # Nodes resolve the others' addresses before any of them is ready.
-            "spec": {"clusterIP": "None", "publishNotReadyAddresses": True, "selector": app},
-        },
+        *_document("kubernetes.yaml", name=export.name, app=app, nodes=content),
         *(_job(export, part, app) for part in export.parts(hosts.__getitem__, run="run")),
     ]
 
@@ -413,55 +385,21 @@ def _job(export: Export, part: Part, app: Mapping[str, str]) -> dict[str, Any]:
         limits["memory"] = f"{resources.mem_bytes}"
     if gpus:
         limits["nvidia.com/gpu"] = "1" if gpus == ("all",) else str(len(gpus))
-    container = {
-        "name": "node",
-        "image": part.image,
-        "imagePullPolicy": "IfNotPresent",
-        "args": list(part.command),
-        "resources": {"limits": limits} if limits else {},
-        "livenessProbe": {"exec": {"command": _is_up(part)}, "periodSeconds": _PROBE_S},
-        "securityContext": {
-            "allowPrivilegeEscalation": False,
-            "readOnlyRootFilesystem": True,
-            "capabilities": {"drop": ["ALL"]},
-        },
-        "volumeMounts": [
-            {"name": "nodes", "mountPath": str(ROOT / NODES_FILE), "subPath": NODES_FILE},
-            {"name": "runs", "mountPath": str(FOLDERS.run)},
-            {"name": "tmp", "mountPath": "/tmp"},
-        ],
-    }
     claim = export.options.volume_claim
     runs = {"persistentVolumeClaim": {"claimName": claim}} if claim else {"emptyDir": {}}
-    pod = {
-        "subdomain": export.name,
-        "restartPolicy": "Never",
-        "terminationGracePeriodSeconds": _stop_s(part),
-        "securityContext": {
-            "runAsNonRoot": True,
-            "runAsUser": 1000,
-            "runAsGroup": 1000,
-            "fsGroup": 1000,
-        },
-        "containers": [container],
-        "volumes": [
-            {"name": "nodes", "configMap": {"name": export.name}},
-            {"name": "runs", **runs},
-            {"name": "tmp", "emptyDir": {}},
-        ],
-    }
-    return {
-        "apiVersion": "batch/v1",
-        "kind": "Job",
-        "metadata": {"name": f"{export.name}-{part.name}", "labels": labels},
-        "spec": {
-            "completionMode": "Indexed",  # gives the pod a predictable host name
-            "completions": 1,
-            "parallelism": 1,
-            "backoffLimit": 0,
-            "template": {"metadata": {"labels": labels}, "spec": pod},
-        },
-    }
+    found: dict[str, Any] = _document(
+        "kubernetes_job.yaml",
+        job=f"{export.name}-{part.name}",
+        labels=labels,
+        name=export.name,
+        stop=_stop_s(part),
+        image=part.image,
+        command=list(part.command),
+        resources={"limits": limits} if limits else {},
+        probe=_is_up(part),
+        runs={"name": "runs", **runs},
+    )
+    return found
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -167,9 +167,26 @@ class Machine:
         """The process that reaches the machine; it leads a session of its own."""
         return self._process.pid
 
-    def begin(self, start: agent.Start, run: Path, control: Callable[[], ControlStream]) -> None:
-        """Start the nodes; ``control`` connects to the supervisor. :meth:`await_started` waits."""
+    def begin(
+        self,
+        start: agent.Start,
+        run: Path,
+        given: Iterable[Path],
+        control: Callable[[], ControlStream],
+    ) -> None:
+        """Start the nodes; :meth:`await_started` waits.
+
+        Args:
+            run: the run folder here.
+            given: files in there that the nodes need.
+            control: connects to the supervisor.
+
+        Raises:
+            EnvironmentFault: a file cannot be read.
+        """
         self._run, self._control = run, control
+        for path in given:
+            self._send_file(path, path.relative_to(run).as_posix())
         self._pump.send(start)
 
     def await_started(self) -> None:
@@ -327,7 +344,9 @@ class Machine:
                 self._require_open()
                 self._pump.send(chunk)
         except OSError as error:
-            raise EnvironmentFault(f"{path} cannot be read: {error.strerror}") from error
+            raise EnvironmentFault(
+                f"{path} cannot be read, and other machines need it: {error.strerror}"
+            ) from error
 
 
 def agent_command(host: Host) -> list[str]:

@@ -87,30 +87,26 @@ class Prepare(Message):
 
 
 class Start(Message):
-    """Start the nodes that were prepared.
+    """Start the nodes that were prepared; the files for them are in the run folder.
 
     Attributes:
         run: its id; ``project``: its name.
         machine: the name of the agent's machine.
         nodes: their ``node.json``.
-        files: texts for the run folder, by name.
         environment: of each node.
         options: of the node program.
         cores: by node.
         monitors_load: whether to record the system load.
-        restored: contents of files of kept values for the folders of nodes, by name.
     """
 
     run: str
     project: str
     machine: str
     nodes: tuple[Mapping[str, Any], ...]
-    files: Mapping[str, str]
     environment: Mapping[str, str]
     options: tuple[str, ...]
     cores: Mapping[str, tuple[int, ...]]
     monitors_load: bool = False
-    restored: Mapping[str, bytes] = {}
 
 
 class KillNode(Message):

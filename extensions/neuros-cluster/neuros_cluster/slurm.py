@@ -39,33 +39,6 @@ _OVER = {
     *("BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "NODE_FAIL"),
     *("OUT_OF_MEMORY", "PREEMPTED", "TIMEOUT"),
 }
-_SCRIPT = """\
-#!/bin/sh
-#SBATCH --job-name={name}
-#SBATCH --nodes={count}
-#SBATCH --ntasks-per-node=1
-#SBATCH --output={name}-%j.log
-{resources}\
-# Submit it with sbatch. The launcher runs on the first node of the allocation, and so do the nodes
-# of the project that the deployment does not name; agents run the others.
-if [ "${{SLURM_JOB_NUM_NODES:-0}}" -lt {count} ]; then
-    echo "this needs a Slurm allocation of {count} node(s): submit it with sbatch" >&2
-    exit 4
-fi
-deployment=$(mktemp --suffix=.json) || exit 4
-trap 'rm -f "$deployment"' EXIT
-trap 'kill -TERM "$launcher"' TERM
-cat >"$deployment" <<'END'
-{deployment}
-END
-{command} --deployment "$deployment" "$@" &
-launcher=$!
-wait "$launcher"
-code=$?
-# A signal ends the first wait, and not the launcher.
-while kill -0 "$launcher" 2>/dev/null; do wait "$launcher"; code=$?; done
-exit "$code"
-"""
 # The steps share what the job has with the batch step, where the launcher is.
 _STEP = ("srun", "--overlap", "--mem=0", "--nodes=1", "--ntasks=1", "--mpi=none")
 
@@ -240,6 +213,12 @@ def _run_in_job(job: Job) -> Any:
 SLURM = SlurmExecutor()
 
 
+def filled(template: str, **values: str) -> str:
+    """The text of a file in ``templates``, with values for its ``@names@``."""
+    text = Path(__file__).with_name("templates").joinpath(template).read_text("utf-8")
+    return re.sub(r"@(\w+)@", lambda match: values[match[1]], text)
+
+
 def slurm_script(
     project: str | os.PathLike[str],
     places: Mapping[str, int],
@@ -272,9 +251,10 @@ def slurm_script(
     }
     nodes = {node: f"node{number}" for node, number in elsewhere.items()}
     name = os.path.basename(os.path.abspath(project)).removesuffix(".json")
-    return _SCRIPT.format(
+    return filled(
+        "job.sh",
         name=_plain(name),
-        count=max(numbers, default=0) + 1,
+        count=str(max(numbers, default=0) + 1),
         resources="".join(f"#SBATCH {line}\n" for line in lines),
         deployment=json.dumps({"hosts": hosts, "nodes": nodes}, indent=2),
         command=shlex.join([neuros, "launch", os.fspath(project), *options]),

@@ -20,10 +20,11 @@ from ending_bench import Bench, assert_ended
 from launching import Finished, Running, killed_in_a_hook, launch, start
 from neuros_cluster.deployment_file import Host
 from neuros_cluster.machine import Machine, agent_command
-from neuros_cluster.messages import Lacking, ThreadsRead
+from neuros_cluster.messages import Lacking, Start, ThreadsRead
 
 import neuros
 from containers import wait_until
+from neuros.backends.control_sockets import connect
 from neuros.control.link import encode
 from neuros.errors import EnvironmentFault
 from neuros.stacks import ProcessThreads
@@ -208,6 +209,19 @@ def test_where_a_node_stands_is_asked_of_its_machine_unless_that_is_gone(tmp_pat
         os.kill(machine.pid, signal.SIGKILL)
         wait_until(lambda: machine.lost)
         assert machine.threads_of("eye") == ProcessThreads(problem=machine.lost)
+    finally:
+        machine.close()
+
+
+def test_a_file_that_nodes_elsewhere_need_is_named_if_it_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "plan.json").mkdir()
+    host = Host("robot", through=("sh", "-c", "exec cat >/dev/null"))
+    machine = Machine(host, ENDED_S, lambda severity, text: None, agent_command(host))
+    start = Start("", "", "robot", (), {}, (), {})
+    said = r"plan\.json cannot be read, and other machines need it: Is a directory"
+    try:
+        with pytest.raises(EnvironmentFault, match=said):
+            machine.begin(start, tmp_path, tmp_path.glob("*.json"), lambda: connect(""))
     finally:
         machine.close()
 

@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 from neuros_cluster.agent import Agent, remove_old_runs
-from neuros_cluster.deployment import _texts
 from neuros_cluster.deployment_file import Host
 from neuros_cluster.files import RECEIVED, RUNS, Follower, TreeStore, chunks_of, scan, write_chunk
 from neuros_cluster.machine import ClockOffset, agent_command
@@ -30,14 +29,9 @@ from neuros_cluster.pump import Pump
 from neuros.backends.control_sockets import UnixListener, connect
 from neuros.control import Hello, LiveCounters, Message, NodeStatus, PublishState, Report, Stop
 from neuros.control.link import encode, to_bytes
-from neuros.errors import EnvironmentFault
 from neuros.ports import ControlStream
 
 _SOON_S = 30.0
-
-
-def damaged(path: Path) -> None:
-    path.write_bytes(b"\xff")
 
 
 def send(project: Path, store: TreeStore, path: str) -> None:
@@ -473,23 +467,6 @@ def wait_for(condition: Callable[[], object]) -> None:
     while not condition():
         assert time.monotonic() < deadline_s
         time.sleep(0.01)
-
-
-class TestGiven:
-    """What a machine is told before its nodes start."""
-
-    def test_it_has_the_texts_of_the_run_folder(self, tmp_path: Path) -> None:
-        (tmp_path / "project.json").write_text("{}")
-        assert _texts(tmp_path) == {"project.json": "{}"}
-
-    @pytest.mark.parametrize("leave", [os.mkdir, damaged])
-    def test_what_cannot_be_read_is_named(
-        self, tmp_path: Path, leave: Callable[[Path], None]
-    ) -> None:
-        leave(tmp_path / "plan.json")
-        said = r"plan\.json cannot be read, and other machines need it: ['\w]"
-        with pytest.raises(EnvironmentFault, match=said):
-            _texts(tmp_path)
 
 
 class TestCommand:

@@ -1,8 +1,7 @@
-"""The back end ``charliecloud``: each node in an unpacked image, without a daemon and without root.
+"""The back end ``apptainer``: each node in an image file, without a daemon and without root.
 
-A node is a process of this machine with another root folder: ``ch-run`` makes it with a user
-namespace and becomes the node. ``ch-convert`` makes the image, a folder, from an image that Docker
-or podman has built.
+A node is a process of this machine with another root folder: ``apptainer exec`` mounts the image
+and becomes the node. ``apptainer build`` makes the image from one that Docker or podman has built.
 """
 
 from __future__ import annotations
@@ -24,32 +23,29 @@ from neuros.options import Option
 from neuros.ports import BackEnd, Deployment, Finding, Launcher, NodeProgram
 from neuros.project.model import Node, NodeFile, Project
 
-_RUNNER = "ch-run"
-_INSTALL = "apt-get install charliecloud, or ask those who run the cluster"
+_RUNNER = "apptainer"
 _PYTHON = Path("/opt/neuros/bin/python")
 """The Python of every image that is built from a recipe."""
 _LIBRARY = Path("/neuros/lib")
-_FOLDER = "~/.local/share/neuros/images"
-_PROBE_S = 30.0
-_USER = {"USER": "neuros"}  # ch-run requires a name
+_PROBE_S = 60.0
 # The launcher's Python, or a module file, sets these, and they name the wrong libraries.
 _UNSET = ("PYTHONHOME", "PYTHONPATH", "LD_LIBRARY_PATH", "LD_PRELOAD", "VIRTUAL_ENV")
 
 
-class Charliecloud(BackEnd):
+class Apptainer(BackEnd):
     """The back end; no run chooses it by itself."""
 
-    name = "charliecloud"
-    place = "an unpacked image"
+    name = "apptainer"
+    place = "an image file"
     has_own_pythons = True
     options = (
         Option(
             ("--image-folder",),
-            "the folder with unpacked images, each named as its container",
-            default=_FOLDER,
+            "the folder with images of Apptainer, CONTAINER.sif",
+            default="~/.local/share/neuros/images",
             variable="NEUROS_IMAGE_FOLDER",
             metavar="FOLDER",
-            page="../extensions/neuros-cluster/README.md#charliecloud",
+            page="../extensions/neuros-cluster/README.md#apptainer",
         ),
     )
 
@@ -59,10 +55,16 @@ class Charliecloud(BackEnd):
         _require_runner(os.environ)
         folder = Path(options["image_folder"]).expanduser().absolute()
         images = {node.container: _image(folder, node.container) for node in nodes}
-        missing = [_missing(name, path) for name, path in images.items() if not _is_image(path)]
+        missing = [
+            f"container '{name}': there is no image {path}: apptainer build {path}"
+            f" docker-daemon:{name}:latest, on a machine that has built it with Docker"
+            for name, path in images.items()
+            if not path.exists()
+        ]
         if missing:
             raise EnvironmentFault("\n".join(missing))
-        _try_image(next(iter(images.values())))
+        for image in dict.fromkeys(images.values()):
+            _try_image(image)
         return _Images(nodes, images)
 
     def checks(self, environ: Mapping[str, str]) -> Iterable[Finding]:
@@ -71,26 +73,26 @@ class Charliecloud(BackEnd):
         try:
             _require_runner(environ)
         except EnvironmentFault as fault:
-            yield Finding.absent("Charliecloud", str(fault))
+            yield Finding.absent("Apptainer", str(fault))
             return
-        images = [each for each in sorted(folder.glob("*")) if _is_image(each)]
+        images = sorted(folder.glob("*.sif"))
         if not images:
-            yield Finding.absent("Charliecloud", f"no unpacked images in {folder}")
+            yield Finding.absent("Apptainer", f"no images in {folder}")
             return
         try:
             _try_image(images[0])
         except EnvironmentFault as fault:
-            yield Finding.bad("Charliecloud", str(fault))
+            yield Finding.bad("Apptainer", str(fault))
             return
-        names = ", ".join(each.name for each in images)
-        yield Finding.good("Charliecloud", f"images in {folder}: {names}")
+        names = ", ".join(each.stem for each in images)
+        yield Finding.good("Apptainer", f"images in {folder}: {names}")
 
 
-BACK_END = Charliecloud()
+BACK_END = Apptainer()
 
 
 class _Images(ProcessDeployment):
-    """A process per node, with ``ch-run`` before its command."""
+    """A process per node, with ``apptainer exec`` before its command."""
 
     def __init__(self, nodes: Sequence[Node], images: Mapping[str, Path]) -> None:
         super().__init__(nodes)
@@ -107,7 +109,7 @@ class _Images(ProcessDeployment):
         return _inside(process, node, self._images[node.node.container])
 
     def record(self) -> Mapping[str, Any]:
-        return {"charliecloud": {name: str(path) for name, path in self._images.items()}}
+        return {"apptainer": {name: str(path) for name, path in self._images.items()}}
 
 
 def _inside(process: NodeProcess, node: NodeFile, image: Path) -> NodeProcess:
@@ -116,60 +118,41 @@ def _inside(process: NodeProcess, node: NodeFile, image: Path) -> NodeProcess:
     seen = {folder: _LIBRARY / name for name, folder in libraries().items()}
     seen |= {path: path for path in (folders.project, folders.workspace, folders.run)}
     seen |= {python: python for python in node.messages}
-    binds: list[str] = []
-    for here, there in sorted(seen.items(), key=lambda pair: len(pair[1].parts)):
-        if here.is_dir():  # an installed NeuROS has no workspace
-            # The image is mounted read-only, so ch-run cannot make the folder.
-            inside = image / there.relative_to("/")
-            try:
-                inside.mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                raise EnvironmentFault(
-                    f"{inside}: {error.strerror}: the image needs this folder, to see {there}"
-                    " there; its owner can make it"
-                ) from error
-            binds.append(f"--bind={here}:{there}")
-    start = [_RUNNER, "--set-env", *binds, f"--cd={process.folder}", str(image), "--"]
-    given = {key: value for key, value in process.environment.items() if key not in _UNSET}
+    binds = [f"--bind={here}:{there}" for here, there in seen.items() if here.is_dir()]
+    # The run folder would otherwise be the current folder or in the home of the user.
+    options = ["--no-home", "--no-mount=cwd", f"--pwd={process.folder}", *binds]
+    options += ["--nv"] if node.node.access.gpus else []
+    # Apptainer sets some variables itself, HOME among them, so a program in the image sets these.
     path = os.pathsep.join([*map(str, node.messages), str(_LIBRARY)])
-    environment = {**_USER, **given, "HOME": "/tmp", "PYTHONPATH": path}
-    environment["XDG_CACHE_HOME"] = "/tmp/.cache"  # the launcher's is not mounted
+    inside = ["HOME=/tmp", f"PYTHONPATH={path}", "XDG_CACHE_HOME=/tmp/.cache"]
+    start = [_RUNNER, "--quiet", "exec", *options, str(image), "/usr/bin/env", *inside]
+    given = {key: value for key, value in process.environment.items() if key not in _UNSET}
     return replace(
         process,
         command=[*start, *process.command],
         node_program=[*start, *process.node_program],
-        environment=environment,
+        environment=given,
     )
 
 
 def _image(folder: Path, container: str) -> Path:
-    return folder / bare_name(container).replace("/", "%").replace(":", "+")
-
-
-def _is_image(path: Path) -> bool:
-    return os.path.lexists(path / _PYTHON.relative_to("/"))
-
-
-def _missing(container: str, path: Path) -> str:
-    if path.is_dir():
-        return f"{path} is no image that can run nodes: it has no {_PYTHON}; build it with NeuROS"
-    return (
-        f"container '{container}': there is no unpacked image {path}: ch-convert -i docker"
-        f" {container} {path}, on a machine that has built it"
-    )
+    return folder / f"{bare_name(container).replace('/', '%').replace(':', '+')}.sif"
 
 
 def _require_runner(environ: Mapping[str, str]) -> None:
     if shutil.which(_RUNNER, path=environ.get("PATH")) is None:
-        raise EnvironmentFault(f"Charliecloud is not installed ({_RUNNER} on PATH): {_INSTALL}")
+        raise EnvironmentFault(
+            f"Apptainer is not installed ({_RUNNER} on PATH): https://apptainer.org, or ask those"
+            " who run the cluster (module load apptainer)"
+        )
 
 
 def _try_image(image: Path) -> None:
-    """Start a program in an image: a machine may forbid user namespaces."""
+    """Start the Python of an image: a machine may forbid user namespaces, or it is another one."""
+    command = [_RUNNER, "--quiet", "exec", "--no-home", "--no-mount=cwd", str(image)]
     try:
         done = subprocess.run(
-            [_RUNNER, str(image), "--", "/bin/true"],
-            env={**_USER, **os.environ},
+            [*command, str(_PYTHON), "-I", "-c", ""],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,
@@ -181,6 +164,7 @@ def _try_image(image: Path) -> None:
         raise EnvironmentFault(f"nothing can be started in {image}: {error}") from error
     if done.returncode:
         raise EnvironmentFault(
-            f"nothing can be started in {image}: {done.stderr.strip()}: does this machine allow"
-            " user namespaces? (unshare --user true)"
+            f"{image} has no {_PYTHON} that starts: {done.stderr.strip()}: is it built from a"
+            " recipe of NeuROS or of the project, and does this machine allow user namespaces"
+            " (unshare --user true)?"
         )
