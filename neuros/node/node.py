@@ -429,12 +429,14 @@ class NodeRuntime:
         else:
             self.on_external_packet(port, packet)
 
-    def on_acknowledgement(self, connection: Connection, position: int) -> None:
+    def on_acknowledgement(
+        self, connection: Connection, position: int, arrival_ns: int | None = None
+    ) -> None:
         """The receiver of a connection has started on packets."""
         engine = self.engine
         assert engine is not None
         try:
-            engine.on_acknowledgement(connection, position)
+            engine.on_acknowledgement(connection, position, arrival_ns)
         except NeurosError as error:
             self.failures.report(error)
 
@@ -489,6 +491,8 @@ class NodeRuntime:
         self.engine = self._services.engine = self._make_engine(
             node, self.file.connections, self.specs, self._effects, self._clock, types
         )
+        if self._virtual is not None:
+            self._virtual.watch(self.engine.awaited)
         if self._is_held:
             self.engine.pause()
         self._time.clock = self.engine.sim_clock
