@@ -16,7 +16,7 @@ still reach it (its *horizon*):
 - The end of a run, for which a node asks at the end of a hook, takes :data:`END_NS`, which lets a
   node be that far behind the others.
 - An acknowledgement changes what its receiver does only if that could block before it. Any other
-  holds nothing up, and may be counted late.
+  holds nothing up, and may be counted late. None is sent before the packet arrives.
 
 That is the null-message algorithm of Chandy and Misra (1979) and Bryant (1977), with states in the
 place of promises, as link-state routing has them in the place of distances: promises that rest on
@@ -53,7 +53,7 @@ class Channel(NamedTuple):
     """One direction of a connection, at its sender.
 
     Attributes:
-        number: the same at both ends.
+        number: the same at both ends; acknowledgements of packets of channel n come on n + 1.
         target: the receiving node.
         delay_ns: least delay of a message.
         window: of acknowledgements, how many packets may be without one; 0: packets.
@@ -115,6 +115,7 @@ class Moment(NamedTuple):
         next_ns: the next event that waits, the end of the hook left out.
         free_ns: the end of the hook that runs; -1: none runs.
         waits_ns: the event that it may not handle yet; -1: it waits for no other node.
+        causes: the nodes that keep it waiting.
         awaited: channels of acknowledgements that could change what it does.
         is_ready: whether its initialise hooks have run, but for those that wait for packets.
         zero_ns: time 0 of the run, if that has come; else -1.
@@ -125,6 +126,7 @@ class Moment(NamedTuple):
     next_ns: int = 0
     free_ns: int = -1
     waits_ns: int = -1
+    causes: Sequence[str] = ()
     awaited: Sequence[int] = ()
     is_ready: bool = False
     zero_ns: int = -1
@@ -168,6 +170,7 @@ class Horizon:
     Attributes:
         neighbours: the nodes at the other ends of its channels.
         begun_ns: time 0 of the run, once that has come.
+        causes: the nodes that keep it from the event that it asked for last.
     """
 
     def __init__(self, node: str, inward: Mapping[int, str], outward: Sequence[Channel]) -> None:
@@ -183,6 +186,9 @@ class Horizon:
         # is known.
         self._under_way: dict[int, deque[tuple[int, int]]] = {c: deque() for c in self._outward}
         self._unhandled: dict[int, deque[int]] = {c: deque() for c in self._outward}
+        # By channel of acknowledgements that come, arrival times of packets that have none.
+        self._unanswered: dict[int, deque[int]] = {c + 1: deque() for c in self._outward}
+        self._answered = dict.fromkeys(self._unanswered, 0)
         self._inboxes: dict[int, Outbox] = {}
         self._states: dict[str, KnownState] = {}
         self._own = KnownState(node, 0, Moment(), self._sources, (), {})
@@ -190,6 +196,7 @@ class Horizon:
         self._told: dict[str, dict[str, KnownState]] = {name: {} for name in self.neighbours}
         self._since_ns: dict[str, int] = {}
         self.begun_ns: int | None = None
+        self.causes: Sequence[str] = ()
 
     # ------------------------------------------------------------------ what happens
 
@@ -204,6 +211,8 @@ class Horizon:
         self._sent[channel] += 1
         self._under_way[channel].append((arrival_ns, position))
         self._unhandled[channel].append(arrival_ns)
+        if channel + 1 in self._inward:
+            self._unanswered[channel + 1].append(arrival_ns)
 
     def receive(self, channel: int) -> int:
         """Count a message that has come, in the order of the channel; returns its number."""
@@ -263,9 +272,9 @@ class Horizon:
             is_all: whether all get what is new, also if they wait for nothing.
         """
         own = self.state(moment)
-        waiting = [(name, state.moment.waits_ns) for name, state in self._states.items()]
+        waiting = [(s.moment.waits_ns, s.moment.causes) for s in self._states.values()]
         if moment.free_ns > moment.now_ns:
-            waiting += [(name, self._pending_ns(state)) for name, state in self._states.items()]
+            waiting += [(self._pending_ns(s), (self.node,)) for s in self._states.values()]
         for name in self.neighbours:
             told = self._told[name]
             others = [state for node, state in self._states.items() if node != name]
@@ -290,9 +299,11 @@ class Horizon:
         """
         for number, queue in self._unhandled.items():
             if len(queue) > _MOST_UNHANDLED and queue[_MOST_UNHANDLED] < time_ns:
+                self.causes = [self._outward[number].target]
                 return self._outward[number].target
-        arrival_ns, source = min(self._arrivals(awaited), default=(NEVER_NS, ""))
-        return source if arrival_ns <= time_ns else ""
+        early = [each for each in self._arrivals(awaited) if each[0] <= time_ns]
+        self.causes = sorted({cause for _, _, cause in early})
+        return min(early)[1] if early else ""
 
     def zero_ns(self, moment: Moment) -> int | None:
         """Time 0 of the run: when nothing is left to do before it; ``None``: not yet.
@@ -334,6 +345,9 @@ class Horizon:
         for position in outbox.positions[self._received[number] - outbox.confirmed :]:
             arrival_ns = outbox.arrival_ns(self._received[number])
             assert arrival_ns is not None
+            for _ in range(position - self._answered[number]):
+                self._unanswered[number].popleft()
+            self._answered[number] = max(position, self._answered[number])
             yield Answer(number, self.receive(number), arrival_ns, position)
 
     def _forget(self, number: int, state: KnownState) -> None:
@@ -354,7 +368,9 @@ class Horizon:
         time_ns = min(times)
         return -1 if time_ns == NEVER_NS else max(time_ns, state.moment.since_ns)
 
-    def _concerns(self, name: str, state: KnownState, waiting: Sequence[tuple[str, int]]) -> bool:
+    def _concerns(
+        self, name: str, state: KnownState, waiting: Sequence[tuple[int, Sequence[str]]]
+    ) -> bool:
         """Whether a neighbour, or a node behind it, may wait for a new state of a node."""
         old = self._told[name].get(state.node)
         if old is None or state.moment.zero_ns < 0:
@@ -367,9 +383,19 @@ class Horizon:
             if before.ending != now.ending or self._has_sent(name, old):
                 return True
             since_ns = self._since_ns.get(name, NEVER_NS) + self._least_delay_ns
-        if now.waits_ns not in (-1, before.waits_ns) or now.now_ns - before.now_ns >= _LAG_NS:
+        # Also if it waited for the same before: an older state may have come on another way since.
+        if now.waits_ns >= 0 and self._may_cause(name, state):
             return True
-        return any(since_ns <= time_ns for node, time_ns in waiting if node != state.node)
+        if now.now_ns - before.now_ns >= _LAG_NS:
+            return True
+        return any(since_ns <= time_ns and state.node in causes for time_ns, causes in waiting)
+
+    def _may_cause(self, name: str, state: KnownState) -> bool:
+        """Whether a neighbour, or a node behind it, may keep the node of a state waiting."""
+        if state is not self._own:
+            return True
+        causes = state.moment.causes
+        return name in causes or not self._told.keys() >= {*causes}
 
     def _has_sent(self, name: str, old: KnownState) -> bool:
         """Whether there are messages that a neighbour must know of, or confirm."""
@@ -387,8 +413,11 @@ class Horizon:
             if self._inward[number] == name
         )
 
-    def _arrivals(self, awaited: Sequence[int]) -> Iterable[tuple[int, str]]:
-        """The earliest times of messages to the node, and of an end, each with its sender."""
+    def _arrivals(self, awaited: Sequence[int]) -> Iterable[tuple[int, str, str]]:
+        """The earliest times of messages to the node, and of an end.
+
+        Each with its sender, and the node whose event may be the first cause of it.
+        """
         states, own = self._states, self._received
         first = {name: state.moment.next_ns for name, state in states.items()}
         if self.begun_ns is not None:
@@ -397,7 +426,7 @@ class Horizon:
                     first[name] = min(first[name], self.begun_ns)
         for neighbour in self.neighbours:
             if neighbour not in states:
-                yield 0, neighbour
+                yield 0, neighbour, neighbour
         # Channels that count, by their sender.
         ways: dict[str, list[Channel]] = {}
         outboxes = [(name, each) for name, state in states.items() for each in state.outboxes]
@@ -405,11 +434,11 @@ class Horizon:
             channel = outbox.channel
             number, target, _, window = channel
             if target == self.node:
-                if window and number not in awaited:
+                if window and (number not in awaited or not self._unanswered[number]):
                     continue
                 arrival_ns = outbox.arrival_ns(own[number])
                 if arrival_ns is not None:
-                    yield arrival_ns, name
+                    yield arrival_ns, name, name
             elif target in states:
                 known = states[target]
                 if window and number not in known.moment.awaited:
@@ -433,19 +462,22 @@ class Horizon:
             free_ns = state.moment.free_ns
             first[name] = free_ns if free_ns >= 0 else max(first[name], state.moment.now_ns)
             waiting.append((first[name], name))
+        cause = {name: name for name in states}
         heapq.heapify(waiting)
         while waiting:  # Dijkstra's algorithm: the nodes in the order in which they may send
             time_ns, name = heapq.heappop(waiting)
             if time_ns > first[name] or time_ns == NEVER_NS:
                 continue
-            for _, target, delay_ns, _ in ways.get(name, ()):
+            for number, target, delay_ns, window in ways.get(name, ()):
                 arrival_ns = time_ns + delay_ns
                 if target == self.node:
-                    yield arrival_ns, name
+                    if window:
+                        arrival_ns = max(arrival_ns, self._unanswered[number][0] + delay_ns)
+                    yield arrival_ns, name, cause[name]
                 elif target in states and states[target].moment.free_ns < 0:
                     sent_ns = max(arrival_ns, states[target].moment.now_ns)
                     if sent_ns < first[target]:
-                        first[target] = sent_ns
+                        first[target], cause[target] = sent_ns, cause[name]
                         heapq.heappush(waiting, (sent_ns, target))
         for name, time_ns in first.items():
-            yield min(time_ns, NEVER_NS - END_NS) + END_NS, name
+            yield min(time_ns, NEVER_NS - END_NS) + END_NS, name, cause[name]

@@ -275,7 +275,7 @@ class RosVirtualLoop(VirtualLoop):
             node.instant_ns,
             NEVER_NS if next_ns is None else next_ns,
             free_ns,
-            self._waits_ns if free_ns < 0 else -1,
+            *((self._waits_ns, tuple(self.horizon.causes)) if self._waits_ns >= 0 else (-1, ())),
             self._awaited_now(),
             self.is_ready,
             self.zero_ns if self.has_begun else -1,
@@ -297,7 +297,9 @@ class RosVirtualLoop(VirtualLoop):
         self._has_posted = False
         end_ns = time.monotonic_ns() + _TURN_NS
         while self.step():
-            if time.monotonic_ns() > end_ns:
+            # All of an instant, and the end of a hook, come before states that others wait for.
+            node = self._nodes[0]
+            if time.monotonic_ns() > end_ns and node.next_ns != node.now_ns:
                 self._wake()
                 break
         self.tell()

@@ -148,7 +148,9 @@ class Apart:
                 self.put(node.name, target, str(channel), (channel, arrival_ns))
         free_ns = -1 if node.free_ns is None else node.free_ns
         waits_ns = node.events[0][0] if node.events else -1
-        moment = Moment(self.now_ns[node.name], node.next_ns, free_ns, waits_ns, zero_ns=0)
+        moment = Moment(
+            self.now_ns[node.name], node.next_ns, free_ns, waits_ns, mine.causes, zero_ns=0
+        )
         for other, states in mine.news(moment):
             self.states_sent += 1
             self.topics[node.name, int(other), "time"] = deque([states])  # the newest counts

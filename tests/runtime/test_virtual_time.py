@@ -18,9 +18,6 @@ from neuros.hooks import (
     neuros_initialise,
     neuros_tick,
 )
-from neuros.project.model import Connection
-from neuros.project.timing import Distribution
-from neuros.runtime.virtual import reach_ns
 from neuros.simulators.mujoco import MuJoCo
 from neuros.time import to_nanoseconds
 
@@ -384,13 +381,27 @@ def test_a_run_ends_after_its_duration_of_virtual_time(tmp_path: Path) -> None:
     assert record["nodes"]["a"]["hooks"]["tick"]["executions"] == 5999
 
 
-def test_the_end_reaches_a_node_over_the_fastest_connections() -> None:
-    delays = {("a", "b"): 0.002, ("b", "c"): 0.001, ("a", "c"): 0.01}
-    wires = [
-        Connection(x, "o", y, "i", index=i, delay=Distribution("constant", (delay,)))
-        for i, ((x, y), delay) in enumerate(delays.items())
-    ]
-    assert reach_ns(wires, "c") == {"c": 0, "b": 1 * MS, "a": 3 * MS}
+def test_the_end_that_a_hook_asks_for_reaches_the_others_after_100_ms(tmp_path: Path) -> None:
+    @neuros_tick(seconds=0.01, outputs="x")
+    def tick_to_50_ms(node: Any) -> Any:
+        if ns(node) >= 50 * MS:
+            node.shutdown("it was enough")
+        return node.make_packet("x")
+
+    @neuros_tick(seconds=0.01, inputs=Optional("x"))
+    def look(node: Any, x: Any) -> None: ...
+
+    a = source(tick_to_50_ms)
+    b, alone = (neuros.Node(name, look, inputs={"x": FLOAT}) for name in ("b", "alone"))
+    described = neuros.Project([a, b, alone], [a["x"] >> b["x"]], folder=tmp_path, time="virtual")
+    with pytest.warns(UserWarning, match="input 'x' of node 'alone' is not connected"):
+        ended = described.run(backend="in-process", output=tmp_path / "run")
+    assert ended.reason.endswith("it was enough")
+    executions = {
+        name: [hook["executions"] for hook in node["hooks"].values()]
+        for name, node in ended.record["nodes"].items()
+    }
+    assert executions == {"a": [5], "b": [14], "alone": [14]}  # the end comes before the 15th tick
 
 
 # ---------------------------------------------------------------------- what is refused
