@@ -482,6 +482,26 @@ def test_a_pace_of_real_time_is_refused(tmp_path: Path) -> None:
         described.run(backend="in-process", duration=1, real_time_factor=1.0)
 
 
+@pytest.mark.parametrize("factor", [0, -1, float("nan"), float("inf"), "fast", True])
+def test_a_pace_that_is_none_is_refused(tmp_path: Path, factor: Any) -> None:
+    described = ticking(tmp_path, time="virtual")
+    with pytest.raises(UsageError, match="--real-time-factor .*: give a number above 0"):
+        described.run(backend="in-process", duration=1, real_time_factor=factor)
+
+
+@pytest.mark.parametrize("backend", ["in-process", "process"])
+def test_a_run_goes_no_faster_than_its_real_time_factor(tmp_path: Path, backend: str) -> None:
+    described = ticking(tmp_path, time="virtual")
+    paced, free = (
+        described.run(
+            backend=backend, duration=2, output=tmp_path / f"{factor}", real_time_factor=factor
+        )
+        for factor in (4.0, None)
+    )
+    assert paced.record["wall_s"] >= 0.49  # 2 s of virtual time in half a second
+    assert paced.record["nodes"]["a"]["hooks"] == free.record["nodes"]["a"]["hooks"]
+
+
 def test_a_main_loop_without_a_duration_is_refused_before_the_start(tmp_path: Path) -> None:
     @neuros_function(inputs=Optional("x"))
     def spin(node: Any, x: Any) -> None: ...
