@@ -1,10 +1,11 @@
 """A node in a process or container of its own, in virtual time, joined to the others by ROS.
 
 It is :mod:`neuros.runtime.virtual` with one node, whose events wait until its horizon lets them
-(:mod:`neuros.engine.horizon`). Packets and acknowledgements are those of real time. When they
-arrive in virtual time stands in the states of nodes, which travel on a topic per node,
-``/neuros/<node>/virtual_time``, as MessagePack in a latched ``std_msgs/msg/UInt8MultiArray``. Each
-message has all that the node knows, so that only the newest one counts.
+(:mod:`neuros.engine.horizon`). Packets are those of real time. When they arrive in virtual time
+stands in the states of nodes, and so do acknowledgements. States travel on a topic for each pair
+of neighbours, ``/neuros/<node>/virtual_time/<neighbour>``, as MessagePack in a latched
+``std_msgs/msg/UInt8MultiArray``. Each message has all that the node knows, so that only the newest
+one counts.
 """
 
 from __future__ import annotations
