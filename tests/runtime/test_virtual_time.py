@@ -485,7 +485,7 @@ def test_a_pace_of_real_time_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("factor", [0, -1, float("nan"), float("inf"), "fast", True])
 def test_a_pace_that_is_none_is_refused(tmp_path: Path, factor: Any) -> None:
     described = ticking(tmp_path, time="virtual")
-    with pytest.raises(UsageError, match="--real-time-factor .*: give a number above 0"):
+    with pytest.raises(UsageError, match=r"--real-time-factor .*: give a number above 0"):
         described.run(backend="in-process", duration=1, real_time_factor=factor)
 
 
