@@ -384,18 +384,15 @@ class Horizon:
                 return True
             since_ns = self._since_ns.get(name, NEVER_NS) + self._least_delay_ns
         # Also if it waited for the same before: an older state may have come on another way since.
-        if now.waits_ns >= 0 and self._may_cause(name, state):
+        if now.waits_ns >= 0 and (
+            state is not self._own
+            or name in now.causes
+            or not self._told.keys() >= {*now.causes}  # behind a neighbour
+        ):
             return True
         if now.now_ns - before.now_ns >= _LAG_NS:
             return True
         return any(since_ns <= time_ns and state.node in causes for time_ns, causes in waiting)
-
-    def _may_cause(self, name: str, state: KnownState) -> bool:
-        """Whether a neighbour, or a node behind it, may keep the node of a state waiting."""
-        if state is not self._own:
-            return True
-        causes = state.moment.causes
-        return name in causes or not self._told.keys() >= {*causes}
 
     def _has_sent(self, name: str, old: KnownState) -> bool:
         """Whether there are messages that a neighbour must know of, or confirm."""

@@ -277,17 +277,12 @@ class RosVirtualLoop(VirtualLoop):
             NEVER_NS if next_ns is None else next_ns,
             free_ns,
             *((self._waits_ns, tuple(self.horizon.causes)) if self._waits_ns >= 0 else (-1, ())),
-            self._awaited_now(),
+            # Once the run ends, all acknowledgements count: it has drained when none is left.
+            tuple(self.find_awaited() if self._end is None else self.answers),
             self.is_ready,
             self.zero_ns if self.has_begun else -1,
             None if self._end is None else Ending(*self._end),
         )
-
-    def _awaited_now(self) -> Sequence[int]:
-        """Once the run ends, all acknowledgements count: it has drained when none is left."""
-        if self._end is None:
-            return tuple(self.find_awaited())
-        return tuple(self.answers)
 
     def _wake(self) -> None:
         if not self._has_posted:

@@ -1,8 +1,9 @@
 """Runs, over and over: ``python -m tests.reproducibility --runs 100 --table FILE``.
 
 Runs each strict example on each back end under changing load; with ``--time virtual``, those that
-lose packets, tick, or have physics that runs by itself, in virtual time. The exit code is 1 if an example had
-packets of more than one digest, or a run failed. Run it with another Python for that one's rows.
+lose packets, tick, or have physics that runs by itself, in virtual time. The exit code is 1 if an
+example had packets of more than one digest, or a run failed. Run it with another Python for that
+one's rows.
 """
 
 from __future__ import annotations
