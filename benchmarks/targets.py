@@ -112,6 +112,12 @@ TARGETS = (
         (Bound("whiskeye-hybrid", 1.0, is_maximum=False),),
     ),
     Target(
+        "WhiskEye strict, process back end, in virtual time",
+        "in real time",
+        "virtual_time",
+        (Bound("virtual-time", 1.15),),
+    ),
+    Target(
         "WhiskEye without discard limit: IMU packets consumed per second",
         "WhiskEye strict",
         "whiskeye",

@@ -42,8 +42,13 @@ class Inbox(Protocol):
     def on_external_packet(self, port: Port, packet: Packet) -> None:
         """A packet has arrived on the external topic of an input."""
 
-    def on_acknowledgement(self, connection: Connection, position: int) -> None:
-        """All hooks at the far end have started on the packets up to ``position`` (from 1)."""
+    def on_acknowledgement(
+        self, connection: Connection, position: int, arrival_ns: int | None = None
+    ) -> None:
+        """All hooks at the far end have started on the packets up to ``position`` (from 1).
+
+        ``arrival_ns``: when this has arrived, on the clock of the node; by default now.
+        """
 
     def on_registered(self, connection: Connection) -> None:
         """The far end of an output's connection is there: it will get the first packet."""
@@ -207,6 +212,9 @@ class NodeLoop(NodeEvents, Protocol):
 
     def announce(self, duration_ns: int) -> None:
         """The hook that starts now takes at least so long."""
+
+    def watch(self, awaited: Callable[[], Sequence[Connection]]) -> None:
+        """``awaited``: connections whose acknowledgements could change which hooks start."""
 
     def ready(self) -> None:
         """The initialise hooks have run, but for those that wait for packets."""

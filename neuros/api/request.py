@@ -292,6 +292,12 @@ class Request(ProjectOptions):
                 object.__setattr__(self, each.name, (given,))
             elif given is None and each.variable:
                 object.__setattr__(self, each.name, each.value(None))
+            elif given is not None and each.parse is positive_seconds:
+                try:
+                    positive_seconds(str(given))
+                except ValueError:
+                    text = f"{each.all_flags[0]} {given}: give a number above 0"
+                    raise UsageError(text) from None
         _ = self.end, self.recording, self.packet_log_bytes  # to raise their errors
 
     @property

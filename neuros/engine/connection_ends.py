@@ -75,6 +75,12 @@ class SendWindow:
         """Packets sent and not acknowledged; 0 on a connection without acknowledgements."""
         return self.sent - self.acknowledged if self.is_reliable else 0
 
+    @property
+    def is_tight(self) -> bool:
+        """Whether it is blocked, or could be after one more packet of each hook."""
+        outstanding = self.outstanding
+        return 0 < outstanding > self.size - max(1, len(self.hooks))
+
     def spend(self, now_ns: int) -> None:
         """Count a sent packet."""
         self.sent += 1

@@ -149,9 +149,15 @@ class Engine:
         if not self._pause.is_still:
             self._pass()
 
-    def on_acknowledgement(self, connection: Connection, position: int) -> None:
-        """All hooks at the far end have started on the packets up to ``position``."""
+    def on_acknowledgement(
+        self, connection: Connection, position: int, arrival_ns: int | None = None
+    ) -> None:
+        """All hooks at the far end have started on the packets up to ``position``.
+
+        ``arrival_ns``: when this has arrived; by default now.
+        """
         now_ns = self._wake()
+        now_ns = now_ns if arrival_ns is None else arrival_ns
         self.send_windows[connection].credit(position, now_ns)
         if not self.execution_log.is_full:
             self.execution_log.record_credit(connection, position, now_ns)
@@ -339,6 +345,10 @@ class Engine:
     def free_running_hooks(self) -> Sequence[Hook]:
         """The node's main loops: function hooks without required inputs."""
         return self._schedule.free_running_hooks()
+
+    def awaited(self) -> Sequence[Connection]:
+        """Connections whose acknowledgements could change which hooks start in the next pass."""
+        return [c for c, window in self.send_windows.items() if window.is_tight]
 
     def untaken_subscriptions(self) -> Sequence[Subscription]:
         """Connections to inputs that no hook declares, without the clock, which the node reads."""

@@ -110,9 +110,11 @@ class LoggedEngine(Engine):
         self._record(self._packet_entries[key])
         super().on_packet(key, packet)
 
-    def on_acknowledgement(self, connection: Connection, position: int) -> None:
+    def on_acknowledgement(
+        self, connection: Connection, position: int, arrival_ns: int | None = None
+    ) -> None:
         self._record(self._acknowledgement_entries[connection] - (position << _POSITION_SHIFT))
-        super().on_acknowledgement(connection, position)
+        super().on_acknowledgement(connection, position, arrival_ns)
 
     def on_registered(self, connection: Connection) -> None:
         self._record(entry_of(EventKind.REGISTERED, connection.index))

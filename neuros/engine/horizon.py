@@ -13,12 +13,18 @@ still reach it (its *horizon*):
 - A state that is older than another can only make the horizon earlier: what a node has done since
   began with an event that its old state counts as waiting.
 - Chains through the node itself are left out: it has not done yet what they would begin with.
-- The end of a run, for which a node asks at the end of a hook, travels along the connections in
-  either direction, and nothing holds it up.
+- The end of a run, for which a node asks at the end of a hook, takes :data:`END_NS`, which lets a
+  node be that far behind the others.
+- An acknowledgement changes what its receiver does only if that could block before it. Any other
+  holds nothing up, and may be counted late. None is sent before the packet arrives.
 
 That is the null-message algorithm of Chandy and Misra (1979) and Bryant (1977), with states in the
 place of promises, as link-state routing has them in the place of distances: promises that rest on
 each other in a circle would rise by one delay per message only.
+
+Old states are safe, so a node tells a neighbour only what that may wait for (:meth:`Horizon.news`):
+what it has sent to it, and, where a node waits for an event, each state that keeps it waiting. Two
+nodes that only send to each other tell each other nothing else.
 
 The time of the machine decides how long a node waits, and never what it does.
 """
@@ -27,28 +33,36 @@ from __future__ import annotations
 
 import heapq
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 NEVER_NS = 2**63 - 1
 """Later than every event, in nanoseconds of virtual time."""
+END_NS = 100_000_000
+"""How long the end of a run, for which a node asks, takes to each other node."""
 
 _MOST_UNHANDLED = 256
 """Past messages that wait at a neighbour before the sender waits for it: bounds their memory."""
+_MOST_UNCONFIRMED = 64
+"""Messages that a node receives before it says so: bounds what states list."""
+_LAG_NS = END_NS // 2
+"""A node that is so much further than it has told says so: others wait for no end from it."""
 
 
 class Channel(NamedTuple):
     """One direction of a connection, at its sender.
 
     Attributes:
-        name: the same at both ends.
+        number: the same at both ends; acknowledgements of packets of channel n come on n + 1.
         target: the receiving node.
         delay_ns: least delay of a message.
+        window: of acknowledgements, how many packets may be without one; 0: packets.
     """
 
-    name: str
+    number: int
     target: str
     delay_ns: int
+    window: int = 0
 
 
 class Outbox(NamedTuple):
@@ -57,16 +71,32 @@ class Outbox(NamedTuple):
     Attributes:
         confirmed: number of messages that the receiver had received, as far as the sender knows.
         arrivals_ns: times of arrival of the others, in their order; none comes before another.
+        positions: what they acknowledge, if they are acknowledgements.
     """
 
     channel: Channel
     confirmed: int
     arrivals_ns: Sequence[int]
+    positions: Sequence[int]
+
+    @property
+    def sent(self) -> int:
+        """Number of messages sent."""
+        return self.confirmed + len(self.arrivals_ns)
 
     def arrival_ns(self, received: int) -> int | None:
         """When the message after so many arrives; ``None``: it is not sent."""
         place = max(0, received - self.confirmed)
         return self.arrivals_ns[place] if place < len(self.arrivals_ns) else None
+
+
+class Answer(NamedTuple):
+    """An acknowledgement that has come: its number on its channel, and what it acknowledges."""
+
+    channel: int
+    number: int
+    arrival_ns: int
+    position: int
 
 
 class Ending(NamedTuple):
@@ -84,6 +114,9 @@ class Moment(NamedTuple):
         now_ns: all events before this time are handled.
         next_ns: the next event that waits, the end of the hook left out.
         free_ns: the end of the hook that runs; -1: none runs.
+        waits_ns: the event that it may not handle yet; -1: it waits for no other node.
+        causes: the nodes that keep it waiting.
+        awaited: channels of acknowledgements that could change what it does.
         is_ready: whether its initialise hooks have run, but for those that wait for packets.
         zero_ns: time 0 of the run, if that has come; else -1.
         ending: the earliest end of the run that it knows.
@@ -92,9 +125,17 @@ class Moment(NamedTuple):
     now_ns: int = 0
     next_ns: int = 0
     free_ns: int = -1
+    waits_ns: int = -1
+    causes: Sequence[str] = ()
+    awaited: Sequence[int] = ()
     is_ready: bool = False
     zero_ns: int = -1
     ending: Ending | None = None
+
+    @property
+    def since_ns(self) -> int:
+        """It sends nothing more before this time."""
+        return max(self.now_ns, self.free_ns)
 
 
 class KnownState(NamedTuple):
@@ -102,7 +143,7 @@ class KnownState(NamedTuple):
 
     Attributes:
         sources: the nodes that send to the node.
-        received: number of messages, by the name of the channel.
+        received: number of messages, by the number of the channel.
     """
 
     node: str
@@ -110,7 +151,12 @@ class KnownState(NamedTuple):
     moment: Moment
     sources: Sequence[str]
     outboxes: Sequence[Outbox]
-    received: Mapping[str, int]
+    received: Mapping[int, int]
+
+    @property
+    def near(self) -> set[str]:
+        """The nodes that have a connection with it."""
+        return {*self.sources, *(outbox.channel.target for outbox in self.outboxes)}
 
 
 class Horizon:
@@ -118,79 +164,95 @@ class Horizon:
 
     Args:
         node: its name.
-        inward: the sending node of each channel that ends at the node, by the channel's name.
+        inward: the sending node of each channel that ends at the node, by the channel's number.
         outward: the channels that begin at the node.
 
     Attributes:
         neighbours: the nodes at the other ends of its channels.
         begun_ns: time 0 of the run, once that has come.
+        causes: the nodes that keep it from the event that it asked for last.
     """
 
-    def __init__(self, node: str, inward: Mapping[str, str], outward: Sequence[Channel]) -> None:
+    def __init__(self, node: str, inward: Mapping[int, str], outward: Sequence[Channel]) -> None:
         self.node = node
         self._sources = tuple(sorted(set(inward.values())))
         self._inward = inward
         self._received = dict.fromkeys(inward, 0)
-        self._outward = {channel.name: channel for channel in outward}
-        self.neighbours = {*self._sources, *(channel.target for channel in outward)}
+        self._outward = {channel.number: channel for channel in outward}
+        self.neighbours = sorted({*self._sources, *(channel.target for channel in outward)})
+        self._least_delay_ns = min((c.delay_ns for c in outward), default=END_NS)
         self._sent = dict.fromkeys(self._outward, 0)
-        # Arrival times of the messages that are not received, and not handled, as far as is known.
-        self._under_way: dict[str, deque[int]] = {name: deque() for name in self._outward}
-        self._unhandled: dict[str, deque[int]] = {name: deque() for name in self._outward}
+        # Messages that are not received, and arrival times of those that are not handled, as far as
+        # is known.
+        self._under_way: dict[int, deque[tuple[int, int]]] = {c: deque() for c in self._outward}
+        self._unhandled: dict[int, deque[int]] = {c: deque() for c in self._outward}
+        # By channel of acknowledgements that come, arrival times of packets that have none.
+        self._unanswered: dict[int, deque[int]] = {c + 1: deque() for c in self._outward}
+        self._answered = dict.fromkeys(self._unanswered, 0)
+        self._inboxes: dict[int, Outbox] = {}
         self._states: dict[str, KnownState] = {}
         self._own = KnownState(node, 0, Moment(), self._sources, (), {})
-        self._reach_ns: dict[str, int] = {}
+        # By neighbour, what it was told, and the first instant that the node has handled since.
+        self._told: dict[str, dict[str, KnownState]] = {name: {} for name in self.neighbours}
+        self._since_ns: dict[str, int] = {}
         self.begun_ns: int | None = None
+        self.causes: Sequence[str] = ()
 
     # ------------------------------------------------------------------ what happens
 
-    def send(self, channel: str, arrival_ns: int) -> None:
+    def handle(self, time_ns: int) -> None:
+        """The node handles events of this instant."""
+        if len(self._since_ns) < len(self.neighbours):
+            for name in self.neighbours:
+                self._since_ns.setdefault(name, time_ns)
+
+    def send(self, channel: int, arrival_ns: int, position: int = 0) -> None:
         """Count a message that the node sends."""
         self._sent[channel] += 1
-        self._under_way[channel].append(arrival_ns)
+        self._under_way[channel].append((arrival_ns, position))
         self._unhandled[channel].append(arrival_ns)
+        if channel + 1 in self._inward:
+            self._unanswered[channel + 1].append(arrival_ns)
 
-    def receive(self, channel: str) -> int:
+    def receive(self, channel: int) -> int:
         """Count a message that has come, in the order of the channel; returns its number."""
         number = self._received[channel] = self._received[channel] + 1
         return number
 
-    def arrival_ns(self, channel: str) -> int | None:
+    def arrival_ns(self, channel: int) -> int | None:
         """When the next message of a channel arrives; ``None``: its sender has not told yet."""
-        source = self._states.get(self._inward[channel])
-        for outbox in () if source is None else source.outboxes:
-            if outbox.channel.name == channel:
-                return outbox.arrival_ns(self._received[channel])
-        return None
+        inbox = self._inboxes.get(channel)
+        return None if inbox is None else inbox.arrival_ns(self._received[channel])
 
-    def learn(self, states: Iterable[KnownState]) -> list[str]:
-        """Keep the states that are newer than what is known; returns whose they are."""
-        news = []
+    def learn(self, states: Iterable[KnownState]) -> list[Answer]:
+        """Keep the states that are newer than what is known; returns new acknowledgements."""
+        answers: list[Answer] = []
         for state in states:
             known = self._states.get(state.node)
-            if state.node != self.node and (known is None or known.version < state.version):
-                news.append(state.node)
-                self._states[state.node] = state
-                if known is None:
-                    self._reach_ns.clear()
-                for name, channel in self._outward.items():
-                    if channel.target == state.node:
-                        self._forget(name, state)
-        return news
-
-    def is_between(self, node: str) -> bool:
-        """Whether a neighbour of this node has no connection with another one."""
-        state = self._states[node]
-        near = {node, *state.sources, *(outbox.channel.target for outbox in state.outboxes)}
-        return not self.neighbours <= near
+            if state.node == self.node or (known is not None and known.version >= state.version):
+                continue
+            self._states[state.node] = state
+            for name, channel in self._outward.items():
+                if channel.target == state.node:
+                    self._forget(name, state)
+            for outbox in state.outboxes:
+                if outbox.channel.target == self.node:
+                    self._inboxes[outbox.channel.number] = outbox
+                    answers.extend(self._new_answers(outbox))
+        return answers
 
     # ------------------------------------------------------------------ what follows
 
     def state(self, moment: Moment) -> KnownState:
         """The state of the node now; it has a new version if anything has changed."""
         outboxes = tuple(
-            Outbox(channel, self._sent[name] - len(under_way), tuple(under_way))
-            for (name, channel), under_way in zip(
+            Outbox(
+                channel,
+                self._sent[number] - len(under_way),
+                tuple(arrival_ns for arrival_ns, _ in under_way),
+                tuple(position for _, position in under_way) if channel.window else (),
+            )
+            for (number, channel), under_way in zip(
                 self._outward.items(), self._under_way.values(), strict=True
             )
         )
@@ -201,18 +263,47 @@ class Horizon:
             )
         return self._own
 
-    @property
-    def others(self) -> Iterable[KnownState]:
-        """The newest states of the other nodes."""
-        return self._states.values()
+    def news(
+        self, moment: Moment, *, is_all: bool = False
+    ) -> Iterator[tuple[str, list[KnownState]]]:
+        """The neighbours that wait for states, each with all that are known.
 
-    def waits_for(self, time_ns: int) -> str:
-        """A node that keeps this one from its events at a time; empty if none does."""
-        for name, queue in self._unhandled.items():
+        Args:
+            is_all: whether all get what is new, also if they wait for nothing.
+        """
+        own = self.state(moment)
+        waiting = [(s.moment.waits_ns, s.moment.causes) for s in self._states.values()]
+        if moment.free_ns > moment.now_ns:
+            waiting += [(self._pending_ns(s), (self.node,)) for s in self._states.values()]
+        for name in self.neighbours:
+            told = self._told[name]
+            others = [state for node, state in self._states.items() if node != name]
+            new = [
+                state
+                for state in (own, *others)
+                if told.get(state.node) is not state and (state is own or name not in state.near)
+            ]
+            if new and (is_all or any(self._concerns(name, each, waiting) for each in new)):
+                told.update((state.node, state) for state in (own, *others))
+                self._since_ns.pop(name, None)
+                if moment.free_ns >= 0:  # what they are told lasts until the end of the hook
+                    self._since_ns[name] = moment.free_ns
+                # A state that no longer lists a message goes with that of its receiver.
+                yield name, [own, *others]
+
+    def waits_for(self, time_ns: int, awaited: Sequence[int] = ()) -> str:
+        """A node that keeps this one from its events at a time; empty if none does.
+
+        Args:
+            awaited: channels of acknowledgements that could change what it does.
+        """
+        for number, queue in self._unhandled.items():
             if len(queue) > _MOST_UNHANDLED and queue[_MOST_UNHANDLED] < time_ns:
-                return self._outward[name].target
-        arrival_ns, source = min(self._arrivals(), default=(NEVER_NS, ""))
-        return source if arrival_ns <= time_ns else ""
+                self.causes = [self._outward[number].target]
+                return self._outward[number].target
+        early = [each for each in self._arrivals(awaited) if each[0] <= time_ns]
+        self.causes = sorted({cause for _, _, cause in early})
+        return min(early)[1] if early else ""
 
     def zero_ns(self, moment: Moment) -> int | None:
         """Time 0 of the run: when nothing is left to do before it; ``None``: not yet.
@@ -224,16 +315,15 @@ class Horizon:
             if state.moment.zero_ns >= 0:
                 return state.moment.zero_ns
         states = {**self._states, self.node: self.state(moment)}
-        if not self.neighbours <= states.keys():
+        if not states.keys() >= {*self.neighbours}:
             return None
         for state in states.values():
             is_idle = state.moment.next_ns == NEVER_NS and state.moment.free_ns < 0
             if not (is_idle and state.moment.is_ready and states.keys() >= {*state.sources}):
                 return None
-            for channel, confirmed, arrivals_ns in state.outboxes:
-                target = states.get(channel.target)
-                sent = confirmed + len(arrivals_ns)
-                if target is None or target.received.get(channel.name, 0) != sent:
+            for outbox in state.outboxes:
+                target = states.get(outbox.channel.target)
+                if target is None or target.received.get(outbox.channel.number, 0) != outbox.sent:
                     return None
         return max(state.moment.now_ns for state in states.values())
 
@@ -247,36 +337,84 @@ class Horizon:
         known = (s.moment.ending for s in self._states.values())
         return min((each for each in known if each is not None), default=None)
 
-    def reach_ns(self) -> Mapping[str, int]:
-        """By node, the least time over connections, in either direction."""
-        if not self._reach_ns:
-            ways: dict[str, list[tuple[str, int]]] = {}
-            for state in [self.state(self._own.moment), *self._states.values()]:
-                for (_, target, delay_ns), _, _ in state.outboxes:
-                    ways.setdefault(state.node, []).append((target, delay_ns))
-                    ways.setdefault(target, []).append((state.node, delay_ns))
-            ahead = [(0, self.node)]
-            while ahead:
-                time_ns, name = heapq.heappop(ahead)
-                if name not in self._reach_ns:
-                    self._reach_ns[name] = time_ns
-                    for other, delay_ns in ways.get(name, ()):
-                        heapq.heappush(ahead, (time_ns + delay_ns, other))
-        return self._reach_ns
-
     # ------------------------------------------------------------------ inside
 
-    def _forget(self, name: str, state: KnownState) -> None:
+    def _new_answers(self, outbox: Outbox) -> Iterator[Answer]:
+        """The acknowledgements of a channel that have not come before."""
+        number = outbox.channel.number
+        for position in outbox.positions[self._received[number] - outbox.confirmed :]:
+            arrival_ns = outbox.arrival_ns(self._received[number])
+            assert arrival_ns is not None
+            for _ in range(position - self._answered[number]):
+                self._unanswered[number].popleft()
+            self._answered[number] = max(position, self._answered[number])
+            yield Answer(number, self.receive(number), arrival_ns, position)
+
+    def _forget(self, number: int, state: KnownState) -> None:
         """Forget messages that the receiver has received, or handled, by its state."""
-        under_way, unhandled = self._under_way[name], self._unhandled[name]
-        left = self._sent[name] - state.received.get(name, 0)
+        under_way, unhandled = self._under_way[number], self._unhandled[number]
+        left = self._sent[number] - state.received.get(number, 0)
         while len(under_way) > left:
             under_way.popleft()
         while len(unhandled) > left and unhandled[0] < state.moment.now_ns:
             unhandled.popleft()
 
-    def _arrivals(self) -> Iterable[tuple[int, str]]:
-        """The earliest times of messages to the node, and of an end, each with its sender."""
+    def _pending_ns(self, state: KnownState) -> int:
+        """The event that a node is to handle next, as far as is known; -1: none."""
+        times = [state.moment.next_ns]
+        for number, under_way in self._under_way.items():
+            if under_way and self._outward[number].target == state.node:
+                times.append(under_way[0][0])
+        time_ns = min(times)
+        return -1 if time_ns == NEVER_NS else max(time_ns, state.moment.since_ns)
+
+    def _concerns(
+        self, name: str, state: KnownState, waiting: Sequence[tuple[int, Sequence[str]]]
+    ) -> bool:
+        """Whether a neighbour, or a node behind it, may wait for a new state of a node."""
+        old = self._told[name].get(state.node)
+        if old is None or state.moment.zero_ns < 0:
+            return True
+        before, now = old.moment, state.moment
+        since_ns = before.since_ns
+        if before.zero_ns < 0:
+            return True
+        if state is self._own:
+            if before.ending != now.ending or self._has_sent(name, old):
+                return True
+            since_ns = self._since_ns.get(name, NEVER_NS) + self._least_delay_ns
+        # Also if it waited for the same before: an older state may have come on another way since.
+        if now.waits_ns >= 0 and (
+            state is not self._own
+            or name in now.causes
+            or not self._told.keys() >= {*now.causes}  # behind a neighbour
+        ):
+            return True
+        if now.now_ns - before.now_ns >= _LAG_NS:
+            return True
+        return any(since_ns <= time_ns and state.node in causes for time_ns, causes in waiting)
+
+    def _has_sent(self, name: str, old: KnownState) -> bool:
+        """Whether there are messages that a neighbour must know of, or confirm."""
+        awaited = self._states[name].moment.awaited if name in self._states else ()
+        for outbox, before in zip(self._own.outboxes, old.outboxes, strict=True):
+            (number, target, _, window), sent = outbox.channel, outbox.sent - before.sent
+            if target == name and sent:
+                if not window or number in awaited or self._own.moment.ending is not None:
+                    return True
+                if 2 * sent >= window:
+                    return True
+        return any(
+            count - old.received[number] >= _MOST_UNCONFIRMED
+            for number, count in self._own.received.items()
+            if self._inward[number] == name
+        )
+
+    def _arrivals(self, awaited: Sequence[int]) -> Iterable[tuple[int, str, str]]:
+        """The earliest times of messages to the node, and of an end.
+
+        Each with its sender, and the node whose event may be the first cause of it.
+        """
         states, own = self._states, self._received
         first = {name: state.moment.next_ns for name, state in states.items()}
         if self.begun_ns is not None:
@@ -285,40 +423,58 @@ class Horizon:
                     first[name] = min(first[name], self.begun_ns)
         for neighbour in self.neighbours:
             if neighbour not in states:
-                yield 0, neighbour
-        for name, under_way in self._under_way.items():
-            target = self._outward[name].target
-            if under_way and target in first:
-                first[target] = min(first[target], under_way[0])
+                yield 0, neighbour, neighbour
+        # Channels that count, by their sender.
+        ways: dict[str, list[Channel]] = {}
+        outboxes = [(name, each) for name, state in states.items() for each in state.outboxes]
+        for name, outbox in outboxes:
+            channel = outbox.channel
+            number, target, _, window = channel
+            if target == self.node:
+                if window and (number not in awaited or not self._unanswered[number]):
+                    continue
+                arrival_ns = outbox.arrival_ns(own[number])
+                if arrival_ns is not None:
+                    yield arrival_ns, name, name
+            elif target in states:
+                known = states[target]
+                if window and number not in known.moment.awaited:
+                    continue
+                arrival_ns = outbox.arrival_ns(known.received.get(number, 0))
+                if arrival_ns is not None and arrival_ns < first[target]:
+                    first[target] = arrival_ns
+            ways.setdefault(name, []).append(channel)
+        for number, under_way in self._under_way.items():
+            _, target, _, window = self._outward[number]
+            if (
+                under_way
+                and target in first
+                and not (window and number not in states[target].moment.awaited)
+            ):
+                first[target] = min(first[target], under_way[0][0])
+        waiting = []
         for name, state in states.items():
             if any(source not in states and source != self.node for source in state.sources):
                 first[name] = 0
-            for outbox in state.outboxes:
-                name_, target, _ = outbox.channel
-                if target == self.node:
-                    arrival_ns = outbox.arrival_ns(own[name_])
-                    if arrival_ns is not None:
-                        yield arrival_ns, name
-                elif target in states:
-                    arrival_ns = outbox.arrival_ns(states[target].received.get(name_, 0))
-                    if arrival_ns is not None:
-                        first[target] = min(first[target], arrival_ns)
-        waiting = [(time_ns, name) for name, time_ns in first.items()]
+            free_ns = state.moment.free_ns
+            first[name] = free_ns if free_ns >= 0 else max(first[name], state.moment.now_ns)
+            waiting.append((first[name], name))
+        cause = {name: name for name in states}
         heapq.heapify(waiting)
-        while waiting:  # Dijkstra's algorithm: the nodes in the order of their first events
+        while waiting:  # Dijkstra's algorithm: the nodes in the order in which they may send
             time_ns, name = heapq.heappop(waiting)
-            if time_ns > first[name]:
+            if time_ns > first[name] or time_ns == NEVER_NS:
                 continue
-            free_ns = states[name].moment.free_ns
-            sent_ns = time_ns if free_ns < 0 else free_ns
-            for channel, _, _ in states[name].outboxes:
-                arrival_ns = sent_ns + channel.delay_ns
-                if channel.target == self.node:
-                    yield arrival_ns, name
-                elif arrival_ns < first.get(channel.target, 0):
-                    first[channel.target] = arrival_ns
-                    heapq.heappush(waiting, (arrival_ns, channel.target))
-        reach_ns = self.reach_ns()
+            for number, target, delay_ns, window in ways.get(name, ()):
+                arrival_ns = time_ns + delay_ns
+                if target == self.node:
+                    if window:
+                        arrival_ns = max(arrival_ns, self._unanswered[number][0] + delay_ns)
+                    yield arrival_ns, name, cause[name]
+                elif target in states and states[target].moment.free_ns < 0:
+                    sent_ns = max(arrival_ns, states[target].moment.now_ns)
+                    if sent_ns < first[target]:
+                        first[target], cause[target] = sent_ns, cause[name]
+                        heapq.heappush(waiting, (sent_ns, target))
         for name, time_ns in first.items():
-            free_ns = states[name].moment.free_ns
-            yield (time_ns if free_ns < 0 else free_ns) + reach_ns[name], name
+            yield min(time_ns, NEVER_NS - END_NS) + END_NS, name, cause[name]

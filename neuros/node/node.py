@@ -431,10 +431,12 @@ class NodeRuntime:
         else:
             self.on_external_packet(port, packet)
 
-    def on_acknowledgement(self, connection: Connection, position: int) -> None:
+    def on_acknowledgement(
+        self, connection: Connection, position: int, arrival_ns: int | None = None
+    ) -> None:
         """The receiver of a connection has started on packets."""
         try:
-            self.loaded.on_acknowledgement(connection, position)
+            self.loaded.on_acknowledgement(connection, position, arrival_ns)
         except NeurosError as error:
             self.failures.report(error)
 
@@ -489,6 +491,8 @@ class NodeRuntime:
         self.loaded = self.engine = self._services.engine = self._make_engine(
             node, self.file.connections, self.specs, self._effects, self._clock, types
         )
+        if self._virtual is not None:
+            self._virtual.watch(self.engine.awaited)
         if self._is_held:
             self.engine.pause()
         self.time.clock = self.engine.sim_clock

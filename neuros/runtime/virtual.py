@@ -15,12 +15,13 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from heapq import heapify, heappop, heappush
 from typing import Any
 
+from neuros.engine.horizon import END_NS
 from neuros.ports import Transport
 from neuros.project.model import Connection, NodeFile
 from neuros.project.timing import LEAST_DELAY_NS, Draws, seed_of
@@ -30,8 +31,6 @@ from neuros.transport.memory import MemoryHub, MemoryLink, MemoryTransport
 _CONTROL, _ARRIVAL, _OWN, _SIMULATOR, _LOOP_BACK = range(5)
 """The events of a node at one instant, in this order."""
 DRAIN_S = 5.0
-_FAR_NS = 1_000_000
-"""How long the end of a run takes to a node that no connection leads to."""
 
 
 class NodeTime:
@@ -41,9 +40,11 @@ class NodeTime:
         now_ns: the time of the node: that of the instant which it handles, or the end of its hook.
         instant_ns: the time of the last instant. While ``now_ns`` is later, a hook holds the node.
         starts: how many hooks have started at ``now_ns``.
+        must_look: whether more may arrive up to ``now_ns`` than was known before the last event.
     """
 
     waits_for = ""
+    must_look = False
 
     def __init__(self, loop: VirtualLoop, name: str, place: int) -> None:
         self._loop = loop
@@ -82,6 +83,9 @@ class NodeTime:
 
     def announce(self, duration_ns: int) -> None:
         """A hook starts that takes at least so long: who waits for the node may go on."""
+
+    def watch(self, awaited: Callable[[], Sequence[Connection]]) -> None:
+        """``awaited``: connections whose acknowledgements could change which hooks start."""
 
     def ready(self) -> None:
         """The initialise hooks have run, but for those that wait for packets."""
@@ -151,7 +155,7 @@ class NodeTime:
         events = self._events
         while events and events[0][0] <= time_ns:
             heappop(events)[-1]()
-            if self.now_ns != time_ns:
+            if self.now_ns != time_ns or self.must_look:
                 return
         for next_due_ns, on_due in self._timers:
             due_ns = next_due_ns()
@@ -212,7 +216,6 @@ class VirtualLoop(LocalLoop):
         self._on_limit: list[Event] = []
         self._calls: list[tuple[int, Event]] = []
         self._end: tuple[int, str, int] | None = None  # time, node that asked, time to drain
-        self.connections: set[Connection] = set()
 
     def of(self, name: str) -> NodeTime:
         """The clock and the events of a node; the first call tells its place among all nodes."""
@@ -279,7 +282,7 @@ class VirtualLoop(LocalLoop):
     def end(self, name: str, drain_s: float) -> None:
         """A node asks for the end, or nobody (``""``): what comes later than now waits.
 
-        The end reaches another node as a packet would, over the fastest connections.
+        The end reaches the other nodes after :data:`neuros.engine.horizon.END_NS`.
         """
         if self._end is None:
             self._end = self.now_ns, name, round(drain_s * 1e9)
@@ -294,7 +297,7 @@ class VirtualLoop(LocalLoop):
         self.waits_for_rest = True
         self.limit_ns = end_ns + drain_ns
         self._on_limit.append(stop)
-        return end_ns + reach_ns(self.connections, stopped).get(name, _FAR_NS if stopped else 0)
+        return end_ns + (END_NS if stopped not in ("", name) else 0)
 
     # ------------------------------------------------------------------ running
 
@@ -418,24 +421,6 @@ class VirtualLoop(LocalLoop):
         return early_s <= 0
 
 
-def reach_ns(connections: Iterable[Connection], start: str) -> dict[str, int]:
-    """By node, the least time from ``start`` over connections in either direction."""
-    steps: dict[str, list[tuple[str, int]]] = {}
-    for c in connections:
-        delay_ns = max(LEAST_DELAY_NS, c.delay.least_ns)
-        steps.setdefault(c.source_node, []).append((c.destination_node, delay_ns))
-        steps.setdefault(c.destination_node, []).append((c.source_node, delay_ns))
-    found: dict[str, int] = {}
-    ahead = [(0, start)]
-    while ahead:
-        time_ns, name = heappop(ahead)
-        if name not in found:
-            found[name] = time_ns
-            for other, delay_ns in steps.get(name, ()):
-                heappush(ahead, (time_ns + delay_ns, other))
-    return found
-
-
 class OneWay:
     """One direction of a connection: when its packets, or its acknowledgements, arrive.
 
@@ -494,7 +479,7 @@ class VirtualLink(MemoryLink):
         way = self._back.send(self._destination.now_ns)
         assert way is not None  # no acknowledgement is lost
         inbox = self._source_end.inbox
-        arrive = partial(inbox.on_acknowledgement, self.connection, position)
+        arrive = partial(inbox.on_acknowledgement, self.connection, position, way[0])
         self._source.arrive(way[0], self.connection.index, way[1], arrive)
 
     def _arrive(self, packet: Any, digest: int | None) -> None:
@@ -564,5 +549,4 @@ class VirtualMiddleware(LocalMiddleware):
         self._virtual.begin_anew(seed_of(nodes))
 
     def _memory_transport(self, file: NodeFile) -> Transport:
-        self._virtual.connections.update(file.connections)
         return VirtualTransport(file, self.hub, self.bridge(file), self._digest, self._digests_of)

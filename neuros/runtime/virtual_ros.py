@@ -1,10 +1,11 @@
 """A node in a process or container of its own, in virtual time, joined to the others by ROS.
 
 It is :mod:`neuros.runtime.virtual` with one node, whose events wait until its horizon lets them
-(:mod:`neuros.engine.horizon`). Packets and acknowledgements are those of real time. When they
-arrive in virtual time stands in the states of nodes, which travel on a topic per node,
-``/neuros/<node>/virtual_time``, as MessagePack in a latched ``std_msgs/msg/UInt8MultiArray``. Each
-message has all that the node knows, so that only the newest one counts.
+(:mod:`neuros.engine.horizon`). Packets are those of real time. When they arrive in virtual time
+stands in the states of nodes, and so do acknowledgements. States travel on a topic for each pair
+of neighbours, ``/neuros/<node>/virtual_time/<neighbour>``, as MessagePack in a latched
+``std_msgs/msg/UInt8MultiArray``. Each message has all that the node knows, so that only the newest
+one counts.
 """
 
 from __future__ import annotations
@@ -21,7 +22,16 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import UInt8MultiArray
 
-from neuros.engine.horizon import NEVER_NS, Channel, Ending, Horizon, KnownState, Moment
+from neuros.engine.horizon import (
+    END_NS,
+    NEVER_NS,
+    Answer,
+    Channel,
+    Ending,
+    Horizon,
+    KnownState,
+    Moment,
+)
 from neuros.ports import Inbox, Transport
 from neuros.project.model import Connection, NodeFile
 from neuros.project.names import INTERNAL
@@ -30,12 +40,15 @@ from neuros.runtime.local import Event
 from neuros.runtime.virtual import DRAIN_S, NodeTime, OneWay, VirtualLoop
 from neuros.transport.codecs import HEADER
 from neuros.transport.lean_node import LeanNode
-from neuros.transport.ros import ReceivingLink, RosTransport, SendingLink, position_of
+from neuros.transport.ros import ReceivingLink, RosTransport, SendingLink
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.ros_process import RosProcess, RosTransportKind
 
 _TURN_NS = 1_000_000
 """How long events of the node may keep those of ROS waiting, besides the hook that runs."""
+
+_TELL_ALL_S = 0.2
+"""How often a node tells all that is new, also what nobody waits for, such as that all are idle."""
 
 _ARRAY = struct.Struct("<4sIII")
 """A ``std_msgs/msg/UInt8MultiArray`` in little-endian CDR, up to its bytes: no dimensions."""
@@ -69,6 +82,17 @@ class RosNodeTime(NodeTime):
     def announce(self, duration_ns: int) -> None:
         self._loop.tell(self.now_ns + duration_ns)
 
+    def watch(self, awaited: Callable[[], Sequence[Connection]]) -> None:
+        self._loop.awaited = awaited
+
+    def step(self, time_ns: int) -> None:
+        self._loop.horizon.handle(time_ns)
+        super().step(time_ns)
+
+    @property
+    def must_look(self) -> bool:  # type: ignore[override]
+        return len(self._loop.find_awaited()) > 0
+
     def hold(self, duration_ns: int) -> None:
         super().hold(duration_ns)
         if duration_ns:
@@ -93,7 +117,8 @@ class RosVirtualLoop(VirtualLoop):
 
     Attributes:
         horizon: of the node.
-        publish: publishes the states that it knows.
+        publish: publishes states for a neighbour.
+        awaited: connections whose acknowledgements could change which hooks start.
         is_ready: whether the node has run its initialise hooks.
         why_waiting: which node keeps this one from its next event; empty if none does.
     """
@@ -102,14 +127,16 @@ class RosVirtualLoop(VirtualLoop):
         super().__init__(seed)
         self._ros_loop = ros
         self.horizon: Horizon
-        self.publish: Callable[[Sequence[KnownState]], None]
+        self.publish: Callable[[str, Sequence[KnownState]], None]
+        self.awaited: Callable[[], Sequence[Connection]] = list
+        # By channel of acknowledgements, what takes in one that has arrived.
+        self.answers: dict[int, Callable[[Answer], None]] = {}
         self.is_ready = False
         self.why_waiting = ""
         self._has_posted = False
-        self._told = 0  # version of the newest state that the neighbours have
-        self._has_news = False
-        # By connection and channel, what has come, and whose time of arrival is not known yet.
-        self._arrived: dict[tuple[Connection, str], deque[Event]] = {}
+        # By connection, what has come, and whose time of arrival is not known yet.
+        self._arrived: dict[Connection, deque[Event]] = {}
+        self._waits_ns = -1
         self._at_zero: Event | None = None
         self._drain: Event | None = None  # what a node does when the end reaches it
         self._is_draining = False
@@ -129,12 +156,8 @@ class RosVirtualLoop(VirtualLoop):
         self._wake()
 
     def drain(self, name: str, stop: Event) -> int:
-        assert self._end is not None
-        end_ns, asking, drain_ns = self._end
-        self.waits_for_rest = self._is_draining = True
-        self.limit_ns = end_ns + drain_ns
-        self._on_limit.append(stop)
-        return end_ns + (self.horizon.reach_ns()[asking] if asking else 0)
+        self._is_draining = True
+        return super().drain(name, stop)
 
     def plan(self, duration_s: float | None, on_end: Event, real_time_factor: float | None) -> None:
         def end() -> None:
@@ -146,17 +169,16 @@ class RosVirtualLoop(VirtualLoop):
 
     # ------------------------------------------------------------------ what arrives
 
-    def arrive(self, connection: Connection, channel: str, event: Event) -> None:
-        """A packet or an acknowledgement has come: handle it when its time has."""
-        self._arrived.setdefault((connection, channel), deque()).append(event)
-        self._wake()
+    def arrive(self, connection: Connection, event: Event) -> None:
+        """A packet has come: handle it when its time has."""
+        self._arrived.setdefault(connection, deque()).append(event)
+        if self.horizon.arrival_ns(_packets(connection)) is not None:
+            self._wake()
 
     def learn(self, states: Sequence[KnownState]) -> None:
         """States of nodes have come."""
-        news = self.horizon.learn(states)
-        if not news:
-            return
-        self._has_news = self._has_news or any(map(self.horizon.is_between, news))
+        for answer in self.horizon.learn(states):
+            self.answers[answer.channel](answer)
         ending = self.horizon.ending()
         if (
             ending is not None
@@ -164,8 +186,8 @@ class RosVirtualLoop(VirtualLoop):
             and (self._end is None or ending < Ending(*self._end))
         ):
             self._end = ending.time_ns, ending.node, ending.drain_ns
-            reach_ns = self.horizon.reach_ns()[ending.node] if ending.node else 0
-            self.limit_ns, self._on_limit = ending.time_ns + reach_ns, []
+            late_ns = END_NS if ending.node else 0
+            self.limit_ns, self._on_limit = ending.time_ns + late_ns, []
         self._wake()
 
     # ------------------------------------------------------------------ running
@@ -183,7 +205,8 @@ class RosVirtualLoop(VirtualLoop):
         self._ros_loop.post_from_thread(self._wake)
 
     def step(self) -> bool:
-        for (connection, channel), events in self._arrived.items():
+        for connection, events in self._arrived.items():
+            channel = _packets(connection)
             while events and (arrival_ns := self.horizon.arrival_ns(channel)) is not None:
                 number = self.horizon.receive(channel)
                 self._nodes[0].arrive(arrival_ns, connection.index, number, events.popleft())
@@ -202,15 +225,23 @@ class RosVirtualLoop(VirtualLoop):
         return super().step()
 
     def tell(self, free_ns: int | None = None) -> None:
-        """Tell the neighbours the state of the node, if they have another; or others' news.
+        """Tell the neighbours the state of the node, as far as they may wait for it.
 
         Args:
             free_ns: when the hook that starts now ends; ``None``: none starts now.
         """
-        state = self.horizon.state(self._moment(free_ns))
-        if state.version != self._told or self._has_news:
-            self._told, self._has_news = state.version, False
-            self.publish([state, *self.horizon.others])
+        for name, states in self.horizon.news(self._moment(free_ns)):
+            self.publish(name, states)
+
+    def tell_all(self) -> None:
+        """Tell the neighbours all that is new."""
+        if self._nodes:
+            for name, states in self.horizon.news(self._moment(), is_all=True):
+                self.publish(name, states)
+
+    def find_awaited(self) -> Sequence[int]:
+        """The channels of acknowledgements that could change what the node does."""
+        return [_positions(connection) for connection in self.awaited()]
 
     def _make_node(self, name: str, place: int) -> NodeTime:
         return RosNodeTime(self, name, place)
@@ -226,7 +257,8 @@ class RosVirtualLoop(VirtualLoop):
     def _may_handle(self, time_ns: int) -> bool:
         if self._is_behind_time_0:
             return False
-        other = self.horizon.waits_for(time_ns)
+        other = self.horizon.waits_for(time_ns, self.find_awaited())
+        self._waits_ns = time_ns if other else -1
         self.why_waiting = ""
         if other:
             self.why_waiting = (
@@ -244,6 +276,9 @@ class RosVirtualLoop(VirtualLoop):
             node.instant_ns,
             NEVER_NS if next_ns is None else next_ns,
             free_ns,
+            *((self._waits_ns, tuple(self.horizon.causes)) if self._waits_ns >= 0 else (-1, ())),
+            # Once the run ends, all acknowledgements count: it has drained when none is left.
+            tuple(self.find_awaited() if self._end is None else self.answers),
             self.is_ready,
             self.zero_ns if self.has_begun else -1,
             None if self._end is None else Ending(*self._end),
@@ -258,7 +293,9 @@ class RosVirtualLoop(VirtualLoop):
         self._has_posted = False
         end_ns = time.monotonic_ns() + _TURN_NS
         while self.step():
-            if time.monotonic_ns() > end_ns:
+            # All of an instant, and the end of a hook, come before states that others wait for.
+            node = self._nodes[0]
+            if time.monotonic_ns() > end_ns and node.next_ns != node.now_ns:
                 self._wake()
                 break
         self.tell()
@@ -272,11 +309,12 @@ class VirtualSendingLink(SendingLink):
         self._loop, self._time = loop, node_time
         self._direction = OneWay(loop.seed, "delay", self._connection)
         self._publish, self.publish = self.publish, self._send
+        loop.answers[_positions(self._connection)] = self._take
 
-    def receive_position(self, data: bytes) -> None:
-        if self.is_open:
-            event = partial(self._inbox.on_acknowledgement, self._connection, position_of(data))
-            self._loop.arrive(self._connection, _positions(self._connection), event)
+    def _take(self, answer: Answer) -> None:
+        _, number, arrival_ns, position = answer
+        event = partial(self._inbox.on_acknowledgement, self._connection, position, arrival_ns)
+        self._time.arrive(arrival_ns, self._connection.index, number, event)
 
     def _send(self, data: bytes) -> None:
         way = self._direction.send(self._time.now_ns)
@@ -300,14 +338,13 @@ class VirtualReceivingLink(ReceivingLink):
         packet = self._decode(data) if self.is_open else None
         if packet is not None:
             event = partial(self._arrive, packet, self._digest(data, packet))
-            self._loop.arrive(self._connection, _packets(self._connection), event)
+            self._loop.arrive(self._connection, event)
 
     def acknowledge(self, position: int) -> None:
-        if self.is_open and self._publish is not None:
+        if self.is_open and self._connection.is_reliable:
             way = self._direction.send(self._time.now_ns)
             assert way is not None  # no acknowledgement is lost
-            self._loop.horizon.send(_positions(self._connection), way[0])
-        super().acknowledge(position)
+            self._loop.horizon.send(_positions(self._connection), way[0], position)
 
     def _arrive(self, packet: Any, digest: int) -> None:
         if self.is_open:
@@ -338,19 +375,22 @@ class RosVirtualTransport(RosTransport):
             else:
                 inward[_packets(c)] = c.source_node
                 if c.is_reliable:
-                    outward.append(Channel(_positions(c), c.source_node, delay_ns))
+                    outward.append(Channel(_positions(c), c.source_node, delay_ns, c.window))
         loop.horizon = Horizon(name, inward, outward)
         namespace = file.names.namespace
-        publisher = ros_node.create_publisher(UInt8MultiArray, _topic(namespace, name), _NEWEST)
-        loop.publish = partial(_publish, publisher)
-        for neighbour in sorted(loop.horizon.neighbours):
+        publishers = {}
+        for other in loop.horizon.neighbours:
+            topic = _topic(namespace, name, other)
+            publishers[other] = ros_node.create_publisher(UInt8MultiArray, topic, _NEWEST)
             ros_node.create_subscription(
                 UInt8MultiArray,
-                _topic(namespace, neighbour),
+                _topic(namespace, other, name),
                 ros.guarded(lambda data: loop.learn(_states_in(data))),
                 _NEWEST,
                 raw=True,
             )
+        loop.publish = lambda other, states: _publish(publishers[other], states)
+        ros.every(ros_node, _TELL_ALL_S, loop.tell_all)
 
     def _data_qos(self, connection: Connection, *, is_reader: bool = False) -> QoSProfile:
         return _ALL
@@ -418,15 +458,15 @@ def _states_in(data: bytes) -> list[KnownState]:
     return _DECODER.decode(data[_ARRAY.size : _ARRAY.size + size])
 
 
-def _topic(namespace: str, node: str) -> str:
-    return f"{namespace}{INTERNAL}{node}/virtual_time"
+def _topic(namespace: str, source: str, target: str) -> str:
+    return f"{namespace}{INTERNAL}{source}/virtual_time/{target}"
 
 
-def _packets(connection: Connection) -> str:
+def _packets(connection: Connection) -> int:
     """The channel of the packets of a connection."""
-    return f"{connection.topic}/data"
+    return 2 * connection.index
 
 
-def _positions(connection: Connection) -> str:
+def _positions(connection: Connection) -> int:
     """The channel of its acknowledgements."""
-    return f"{connection.topic}/ack"
+    return 2 * connection.index + 1

@@ -105,7 +105,9 @@ class Neighbours:
     def on_external_packet(self, port: Port, packet: Any) -> None:
         """Neighbours have no external topics."""
 
-    def on_acknowledgement(self, connection: Connection, position: int) -> None:
+    def on_acknowledgement(
+        self, connection: Connection, position: int, arrival_ns: int | None = None
+    ) -> None:
         """The node has started on packets: more may be sent."""
         self._windows[connection].credit(position, 0)
         self._send_waiting(connection)

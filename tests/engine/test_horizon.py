@@ -123,41 +123,37 @@ class Apart:
         self.last: dict[int, int] = {}
         self.now_ns = [0] * len(nodes)
         self.states_sent = 0
-        self.told: list[list[horizon.KnownState]] = [[] for _ in nodes]
         self.horizons = [self.horizon_of(node) for node in nodes]
 
     def horizon_of(self, node: Behaviour) -> Horizon:
         outward = [i for i, each in enumerate(self.channels) if each.source == node.name]
         return Horizon(
             str(node.name),
-            {str(i): str(c.source) for i, c in enumerate(self.channels) if c.target == node.name},
+            {i: str(c.source) for i, c in enumerate(self.channels) if c.target == node.name},
             [
-                horizon.Channel(str(i), str(c.target), c.delay_ns)
+                horizon.Channel(i, str(c.target), c.delay_ns)
                 for i, c in ((i, self.channels[i]) for i in outward)
             ],
         )
-
-    def neighbours(self, node: int) -> set[int]:
-        ends = [{each.source, each.target} for each in self.channels]
-        return {other for both in ends if node in both for other in both} - {node}
 
     def advance(self, node: Behaviour) -> None:
         mine = self.horizons[node.name]
         while node.events and not mine.waits_for(node.events[0][0]):
             self.now_ns[node.name] = node.events[0][0]
+            mine.handle(node.events[0][0])
             for message in node.handle():
                 channel, arrival_ns = in_order(self.channels, self.last, message)
-                mine.send(str(channel), arrival_ns)
+                mine.send(channel, arrival_ns)
                 target = self.channels[channel].target
                 self.put(node.name, target, str(channel), (channel, arrival_ns))
         free_ns = -1 if node.free_ns is None else node.free_ns
-        state = mine.state(Moment(self.now_ns[node.name], node.next_ns, free_ns))
-        states = [state, *mine.others]
-        if states != self.told[node.name]:
-            self.told[node.name] = states
+        waits_ns = node.events[0][0] if node.events else -1
+        moment = Moment(
+            self.now_ns[node.name], node.next_ns, free_ns, waits_ns, mine.causes, zero_ns=0
+        )
+        for other, states in mine.news(moment):
             self.states_sent += 1
-            for other in self.neighbours(node.name):
-                self.topics[node.name, other, "time"] = deque([states])  # the newest counts
+            self.topics[node.name, int(other), "time"] = deque([states])  # the newest counts
 
     def put(self, source: int, target: int, topic: str, what: object) -> None:
         self.topics.setdefault((source, target, topic), deque()).append(what)
@@ -173,7 +169,7 @@ class Apart:
                 self.horizons[target].learn(what)
             else:
                 node.receive(*what)
-                self.horizons[target].receive(topic)
+                self.horizons[target].receive(int(topic))
             self.advance(node)
 
 
@@ -216,18 +212,18 @@ def test_nodes_apart_handle_the_same_events_as_in_one_queue(
 
 def test_a_source_without_answers_waits_for_a_slow_receiver() -> None:
     """Its messages wait at the receiver: their number stays within bounds."""
-    source = Horizon("source", {}, [horizon.Channel("c", "sink", 10)])
-    receiver = Horizon("sink", {"c": "source"}, [])
+    source = Horizon("source", {}, [horizon.Channel(0, "sink", 10)])
+    receiver = Horizon("sink", {0: "source"}, [])
     source.learn([receiver.state(Moment(0, NEVER_NS))])
     assert source.waits_for(0) == ""
     time_ns = sent = 0
     while not source.waits_for(time_ns):
-        source.send("c", time_ns + 10)
+        source.send(0, time_ns + 10)
         time_ns, sent = time_ns + 1, sent + 1
         assert sent < 1_000
     assert source.waits_for(time_ns) == "sink"
     for _ in range(sent):
-        receiver.receive("c")
+        receiver.receive(0)
     source.learn([receiver.state(Moment(0, 10))])
     assert source.waits_for(time_ns) == "sink"  # received, and not handled
     source.learn([receiver.state(Moment(time_ns, time_ns))])
@@ -235,8 +231,8 @@ def test_a_source_without_answers_waits_for_a_slow_receiver() -> None:
 
 
 def test_messages_with_a_long_delay_are_no_backlog() -> None:
-    source = Horizon("source", {}, [horizon.Channel("c", "sink", 1_000_000)])
-    source.learn([Horizon("sink", {"c": "source"}, []).state(Moment(0, NEVER_NS))])
+    source = Horizon("source", {}, [horizon.Channel(0, "sink", 1_000_000)])
+    source.learn([Horizon("sink", {0: "source"}, []).state(Moment(0, NEVER_NS))])
     for time_ns in range(10_000):
         assert source.waits_for(time_ns) == ""
-        source.send("c", time_ns + 1_000_000)
+        source.send(0, time_ns + 1_000_000)

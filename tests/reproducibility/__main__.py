@@ -1,7 +1,9 @@
-"""Strict runs, over and over: ``python -m tests.reproducibility --runs 100 --table FILE``.
+"""Runs, over and over: ``python -m tests.reproducibility --runs 100 --table FILE``.
 
-Runs each strict example on each back end under changing load. The exit code is 1 if an example had
-packets of more than one digest, or a run failed. Run it with another Python for that one's rows.
+Runs each strict example on each back end under changing load; with ``--time virtual``, those that
+lose packets, tick, or have physics that runs by itself, in virtual time. The exit code is 1 if an
+example had packets of more than one digest, or a run failed. Run it with another Python for that
+one's rows.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ from pathlib import Path
 
 from tests.support.tables import update_rows
 
-from .running import BACKENDS, STRICT, Repeated, changing_load, differing, repeat
+from .running import BACKENDS, STRICT, VIRTUAL, Repeated, changing_load, differing, repeat
 
 _HEAD = "| example | back end | Python | runs | packets in each | digests |"
 
@@ -23,7 +25,7 @@ def main() -> int:
     options = _options()
     found: list[Repeated] = []
     with changing_load(options.seed):
-        for project in options.project or STRICT:
+        for project in options.project or (VIRTUAL if options.time == "virtual" else STRICT):
             for backend in options.backend or BACKENDS:
                 with tempfile.TemporaryDirectory(prefix="neuros-reproducibility-") as name:
                     repeated = repeat(project, backend, options.runs, Path(name))
@@ -50,7 +52,10 @@ def _options() -> argparse.Namespace:
     parser = argparse.ArgumentParser("python -m tests.reproducibility", description=__doc__)
     parser.add_argument("--runs", type=int, default=10, help="so many of each (10)")
     parser.add_argument("--backend", action="append", choices=BACKENDS, help="repeatable")
-    parser.add_argument("--project", action="append", choices=tuple(STRICT), help="repeatable")
+    parser.add_argument(
+        "--project", action="append", choices=(*STRICT, *VIRTUAL), help="repeatable"
+    )
+    parser.add_argument("--time", choices=("real", "virtual"), default="real", help="(real)")
     parser.add_argument("--seed", type=int, default=1, help="of the load (1)")
     parser.add_argument("--table", type=Path, metavar="FILE", help="put the rows into its table")
     return parser.parse_args()

@@ -1,4 +1,6 @@
-"""Strict examples carry the same packets in every run, on every back end, under changing load.
+"""Examples carry the same packets in every run, on every back end, under changing load.
+
+Strict ones do in real time, and all in virtual time.
 
 ``python -m tests.reproducibility`` runs each a hundred times.
 """
@@ -12,7 +14,7 @@ import pytest
 
 from containers import IMAGES, require_containers
 
-from .running import BACKENDS, STRICT, Repeated, changing_load, differing, repeat
+from .running import BACKENDS, STRICT, VIRTUAL, Repeated, changing_load, differing, repeat
 
 QUICK = "2_synchronisation/tennis"
 
@@ -37,6 +39,15 @@ def test_two_runs_on_each_back_end_without_docker_carry_the_same_packets(tmp_pat
 def test_five_runs_on_each_back_end_carry_the_same_packets(project: str, tmp_path: Path) -> None:
     require_containers(*IMAGES)
     check(project, BACKENDS, 5, tmp_path)
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("project", VIRTUAL)
+def test_three_runs_in_virtual_time_on_each_back_end_are_the_same(
+    project: str, tmp_path: Path
+) -> None:
+    require_containers(*IMAGES)
+    check(project, BACKENDS, 3, tmp_path)
 
 
 def test_one_run_with_other_packets_is_noticed() -> None:

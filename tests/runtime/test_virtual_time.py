@@ -18,9 +18,6 @@ from neuros.hooks import (
     neuros_initialise,
     neuros_tick,
 )
-from neuros.project.model import Connection
-from neuros.project.timing import Distribution
-from neuros.runtime.virtual import reach_ns
 from neuros.simulators.mujoco import MuJoCo
 from neuros.time import to_nanoseconds
 
@@ -384,13 +381,27 @@ def test_a_run_ends_after_its_duration_of_virtual_time(tmp_path: Path) -> None:
     assert record["nodes"]["a"]["hooks"]["tick"]["executions"] == 5999
 
 
-def test_the_end_reaches_a_node_over_the_fastest_connections() -> None:
-    delays = {("a", "b"): 0.002, ("b", "c"): 0.001, ("a", "c"): 0.01}
-    wires = [
-        Connection(x, "o", y, "i", index=i, delay=Distribution("constant", (delay,)))
-        for i, ((x, y), delay) in enumerate(delays.items())
-    ]
-    assert reach_ns(wires, "c") == {"c": 0, "b": 1 * MS, "a": 3 * MS}
+def test_the_end_that_a_hook_asks_for_reaches_the_others_after_100_ms(tmp_path: Path) -> None:
+    @neuros_tick(seconds=0.01, outputs="x")
+    def tick_to_50_ms(node: Any) -> Any:
+        if ns(node) >= 50 * MS:
+            node.shutdown("it was enough")
+        return node.make_packet("x")
+
+    @neuros_tick(seconds=0.01, inputs=Optional("x"))
+    def look(node: Any, x: Any) -> None: ...
+
+    a = source(tick_to_50_ms)
+    b, alone = (neuros.Node(name, look, inputs={"x": FLOAT}) for name in ("b", "alone"))
+    described = neuros.Project([a, b, alone], [a["x"] >> b["x"]], folder=tmp_path, time="virtual")
+    with pytest.warns(UserWarning, match="input 'x' of node 'alone' is not connected"):
+        ended = described.run(backend="in-process", output=tmp_path / "run")
+    assert ended.reason.endswith("it was enough")
+    executions = {
+        name: [hook["executions"] for hook in node["hooks"].values()]
+        for name, node in ended.record["nodes"].items()
+    }
+    assert executions == {"a": [5], "b": [14], "alone": [14]}  # the end comes before the 15th tick
 
 
 # ---------------------------------------------------------------------- what is refused
@@ -469,6 +480,26 @@ def test_a_pace_of_real_time_is_refused(tmp_path: Path) -> None:
     described = ticking(tmp_path)
     with pytest.raises(UsageError, match="add --time virtual"):
         described.run(backend="in-process", duration=1, real_time_factor=1.0)
+
+
+@pytest.mark.parametrize("factor", [0, -1, float("nan"), float("inf"), "fast", True])
+def test_a_pace_that_is_none_is_refused(tmp_path: Path, factor: Any) -> None:
+    described = ticking(tmp_path, time="virtual")
+    with pytest.raises(UsageError, match=r"--real-time-factor .*: give a number above 0"):
+        described.run(backend="in-process", duration=1, real_time_factor=factor)
+
+
+@pytest.mark.parametrize("backend", ["in-process", "process"])
+def test_a_run_goes_no_faster_than_its_real_time_factor(tmp_path: Path, backend: str) -> None:
+    described = ticking(tmp_path, time="virtual")
+    paced, free = (
+        described.run(
+            backend=backend, duration=2, output=tmp_path / f"{factor}", real_time_factor=factor
+        )
+        for factor in (4.0, None)
+    )
+    assert paced.record["wall_s"] >= 0.49  # 2 s of virtual time in half a second
+    assert paced.record["nodes"]["a"]["hooks"] == free.record["nodes"]["a"]["hooks"]
 
 
 def test_a_main_loop_without_a_duration_is_refused_before_the_start(tmp_path: Path) -> None:

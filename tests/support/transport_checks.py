@@ -60,7 +60,9 @@ class RecordingInbox:
     def on_external_packet(self, port: Port, packet: Any) -> None:
         self.external.append(packet)
 
-    def on_acknowledgement(self, connection: Connection, position: int) -> None:
+    def on_acknowledgement(
+        self, connection: Connection, position: int, arrival_ns: int | None = None
+    ) -> None:
         self.acknowledged.setdefault(connection, []).append(position)
         self.on_credit(connection)
 
