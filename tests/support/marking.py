@@ -79,12 +79,19 @@ BY_NAME = {
         "recording/test_provenance.py",
         "backends/test_container_pythons.py",
         "backends/test_placement.py",
-        "backends/test_reaper.py",
-        "backends/test_shared_memory.py::test_the_reaper",
+        "backends/test_guardian.py",
+        "backends/test_shared_memory.py::test_the_guardian",
         "benchmarks/test_against.py::test_a_commit_that_is_none",
         "benchmarks/test_command.py",
         "benchmarks/test_reproduce_command.py",
-        "cli/test_command_line.py::test_what_could_not_be_started",
+        *(
+            f"cli/test_command_line.py::test_{name}"
+            for name in (
+                *("a_core_that", "a_folder_that_cannot", "a_machine_without_rclpy"),
+                *("a_name_that", "a_plugin_in_place", "nor_one", "simulated_time_needs"),
+                *("what_could_not_be_started", "wrong_usage"),
+            )
+        ),
         "cli/test_validate_command.py",
         "doctor/test_checks.py",
         "faults/",
