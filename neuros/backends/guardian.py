@@ -11,7 +11,7 @@ subreaper: it may be a user's program with other children. Processes that the la
 itself have the run's id in their environment, or are announced.
 
 The guardian is also the fork server of nodes: it imports NeuROS and ROS once, while the launcher
-reads the project, and forks a node process with all of that in place. What a library reads from the
+plans the run, and forks a node process with all of that in place. What a library reads from the
 environment when it is loaded must be as in the guardian; otherwise, and for other programs, a
 process is started by ``execve``. A fork differs from such a process in nothing that a plugin or a
 tool sees: command line and environment in ``/proc``, output, session, signals, cores, random seeds.

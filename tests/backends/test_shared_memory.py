@@ -134,6 +134,7 @@ def test_a_folder_that_does_not_exist_is_clean(tmp_path: Path) -> None:
 def test_the_guardian_removes_the_segments_of_its_run() -> None:
     run_id = secrets.token_hex(8)
     guardian = Guardian.start(run_id)
+    guardian.await_ready()
     segment = SHM / f"neuros_{run_id}_camera_image_1"
     try:
         segment.write_bytes(b"x" * 64)
@@ -234,6 +235,7 @@ def test_a_killed_run_leaves_nothing_and_its_neighbours_go_on(
 ) -> None:
     run_id = secrets.token_hex(8)
     guardian = Guardian.start(run_id)
+    guardian.await_ready()
     try:
         # The run is there first, so that its neighbours know, and map, its memory.
         nodes.append(RosNode("talker_of_the_run", domain.id, run_id))
@@ -267,6 +269,7 @@ def test_a_run_that_is_alone_leaves_shared_memory_as_it_was(
 ) -> None:
     run_id = secrets.token_hex(8)
     guardian = Guardian.start(run_id)
+    guardian.await_ready()
     try:
         nodes.append(RosNode("listener", domain.id, run_id))
         nodes.append(RosNode("talker", domain.id, run_id))

@@ -88,8 +88,8 @@ BY_NAME = {
             f"cli/test_command_line.py::test_{name}"
             for name in (
                 *("a_core_that", "a_folder_that_cannot", "a_machine_without_rclpy"),
-                *("a_name_that", "a_plugin_in_place", "nor_one", "simulated_time_needs"),
-                *("what_could_not_be_started", "wrong_usage"),
+                *("a_name_that", "a_plugin_in_place", "nor_one"),
+                *("simulated_time_needs", "what_could_not_be_started", "wrong_usage"),
             )
         ),
         "cli/test_validate_command.py",
@@ -99,6 +99,8 @@ BY_NAME = {
         "extensions/neuros-cluster/tests/test_charliecloud_back_end.py",
         "simulators/test_mujoco_opengl.py::TestDoctor",
         "snn/test_documented_node.py::test_its_spikes",
+        "test_extensions.py::test_a_launch_without_options",
+        "test_extensions.py::test_so_is_that_of_a_deployment",
         "test_extensions.py::test_what_an_extension_brings",
         "test_installation.py",
         "test_packages_installed.py",
