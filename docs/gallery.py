@@ -20,10 +20,10 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from neuros_analysis.graph_picture import graph_svg
 from tutorial_files import files_of, steps
 
 from neuros.installation.machine import offscreen_opengl
-from neuros.project.graph import graph_svg
 from neuros.project.load import load_project
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -1,4 +1,4 @@
-"""What the last bits of floating-point results depend on: processor level and libraries."""
+"""Processor level and libraries, on which the last bits of floating-point results depend."""
 
 from __future__ import annotations
 

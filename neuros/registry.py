@@ -193,7 +193,7 @@ MODELS: Registry[ModelFormat] = Registry(
 )
 EXECUTORS: Registry[SweepExecutor] = Registry("neuros.executors", "executor", SweepExecutor)
 BAG_FORMATS: Registry[Callable[..., Any]] = Registry("neuros.bag_formats", "format", object)
-"""Conversions of recorded topics and runs into types of other libraries."""
+"""Conversions of projects, runs and recorded topics into other formats and types."""
 CHECKS: Registry[MachineCheck] = Registry("neuros.checks", "check", MachineCheck)
 PLUGIN_CHECKS: Registry[PluginCheck] = Registry("neuros.plugin_checks", "plugin", PluginCheck)
 

@@ -63,7 +63,8 @@ PACKAGES = (
     Package(7, ("api",)),
     Package(7, ("testing",)),
     Package(8, ("pytest_plugin",)),
-    Package(8, ("cli", "doctor", "replay")),
+    Package(8, ("ros_launch",)),
+    Package(8, ("cli", "doctor")),
 )
 # neuros itself holds public names; every package may ask it for the version. Those of others
 # it imports when they are asked for.
@@ -111,6 +112,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "backends.console": {"tqdm"},
     "backends.virtual_environments": {"packaging"},
     "pytest_plugin": {"pytest"},
+    "ros_launch": {"launch"},
     "api.packets": {"numpy", "xxhash"},
     "api.run_record": {"tabulate"},
     "api.session": {"numpy"},
@@ -123,9 +125,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "cli.main": {"argcomplete"},
     "cli.template": {"std_msgs"},
     "cli.live": {"tabulate"},
-    "cli.replay": {"tabulate"},
     "cli.runs": {"tabulate"},
-    "replay.replayed_node": {"debugpy"},
     "node.copies": {"numpy"},
     "recording": {"mcap", "rosbags", "psutil", "tabulate", "numpy", "xxhash"},
     "recording.stored": {"mcap", "rosbags", "ruamel", "backports", "compression"},

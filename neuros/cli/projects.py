@@ -26,7 +26,7 @@ from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import NeurosError, ProjectError, UsageError
 from neuros.ports import RobotChoices
 from neuros.project.suggest import counted, did_you_mean
-from neuros.registry import MODELS
+from neuros.registry import BAG_FORMATS, MODELS
 
 EXIT_NODE = 1
 EXIT_PROJECT = 3
@@ -157,11 +157,12 @@ def _types(options: argparse.Namespace) -> int:
 
 def _graph(options: argparse.Namespace) -> int:
     """Write the graph of a project. Raises ``UsageError`` if the file cannot be written."""
-    from neuros.project.graph import graph_mermaid, graph_svg, graph_text
+    from neuros.project.graph import graph_mermaid, graph_text
 
-    makers = {"text": graph_text, "mermaid": graph_mermaid, "svg": graph_svg}
+    makers = {"text": graph_text, "mermaid": graph_mermaid}
     kind = options.format or _GRAPH_SUFFIXES.get(Path(options.output or "").suffix, "text")
-    text = makers[kind](load_with_messages(options, reads_plugins=False)[0])
+    make = makers.get(kind) or BAG_FORMATS.load(kind)
+    text = make(load_with_messages(options, reads_plugins=False)[0])
     if options.output is None:
         print(text)
         return 0

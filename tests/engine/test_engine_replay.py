@@ -11,10 +11,7 @@ import pytest
 from engine_bench import Bench, function, initialise, tick, wire
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from neuros.engine.event_log import (
-    EventKind,
-    LoggedEngine,
+from neuros_analysis.replay.script import (
     Player,
     ReplayedEngine,
     ReplayOver,
@@ -26,6 +23,8 @@ from neuros.engine.event_log import (
     is_whole,
     starts_of,
 )
+
+from neuros.engine.event_log import EventKind, LoggedEngine
 from neuros.hooks import HookSpec, Optional
 from neuros.project.model import Connection
 

@@ -28,6 +28,9 @@ from zlib import crc32
 from neuros_analysis.charts import load_figure
 from neuros_analysis.comparison import comparison_rows
 from neuros_analysis.findings import findings_of
+from neuros_analysis.graph_picture import graph_svg
+from neuros_analysis.replay.recorded_node import RecordedNode, recorded_node, recorded_run
+from neuros_analysis.replay.script import Script
 from neuros_analysis.review import open_for_review
 from neuros_analysis.run_pages import figures_of, panels_page, picture, report_page, world_pages
 from neuros_dashboard.live_metrics import ObservedRun
@@ -40,15 +43,13 @@ from neuros.api.run_record import open_run
 from neuros.api.verify import RecordedPackets, compare
 from neuros.cli.main import main
 from neuros.control.link import ControlLink, decode, decoder_of, to_bytes
-from neuros.engine.event_log import Script
 from neuros.errors import ControlError, NeurosError, ProtocolError
 from neuros.launcher.peers import RUNNING, PeerState, state_from
-from neuros.project.graph import graph_mermaid, graph_svg, graph_text
+from neuros.project.graph import graph_mermaid, graph_text
 from neuros.project.load import load_project
 from neuros.project.model import Folders
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
 from neuros.recording.recorder import Recorder
-from neuros.replay.recorded_node import RecordedNode, recorded_node, recorded_run
 from neuros.transport.codecs import WrongBytes, message_codec
 from neuros.transport.large_packets import LargeInput, LargeOutput
 from neuros.transport.message_buffers import message_buffers

@@ -1,4 +1,4 @@
-"""Reports, timing and comparisons of runs, frames of recorded packets, and sweeps."""
+"""Reports, timing, comparisons, replays and forks of runs, frames of packets, and sweeps."""
 
 from neuros.ports import Subcommand
 
@@ -12,4 +12,13 @@ TIMING = Subcommand(
 )
 SWEEP = Subcommand(
     "neuros_analysis.command", "run a project with many values and seeds, and make one table"
+)
+REPLAY = Subcommand(
+    "neuros_analysis.replay.command",
+    "run one node of a recorded run again, or publish recorded topics",
+)
+REPLAYED = Subcommand("neuros_analysis.replay.command")
+FORK = Subcommand(
+    "neuros_analysis.fork_command",
+    "run a past run again up to a moment, then go on with a change",
 )

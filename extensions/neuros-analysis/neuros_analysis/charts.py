@@ -15,9 +15,10 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, StrMethodF
 
 from neuros.api.packets import Numbers
 from neuros.engine.metrics import TimeBudget
-from neuros.project.graph import Place, guarantee, lay_out, port_names
+from neuros.project.graph import guarantee, port_names
 from neuros.recording.system_load import FILE_NAME
 from neuros_analysis.comparison import figures_of, labels_of
+from neuros_analysis.graph_picture import Place, lay_out
 from neuros_analysis.review import ReviewedRun, read_load
 
 # Okabe and Ito, Color Universal Design (2008).

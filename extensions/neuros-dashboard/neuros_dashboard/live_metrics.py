@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import itertools
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict, defaultdict, deque
 from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any, TypeAlias
@@ -28,6 +28,7 @@ from neuros.control import (
 from neuros.control.link import ControlLink
 from neuros.engine.metrics import in_flight_and_lost, time_budget_of
 from neuros.errors import ControlError
+from neuros.recording.system_load import LAUNCHER, LoadMeter
 from neuros_dashboard.pages import Pages, data_url
 
 WINDOW_S = 1.0
@@ -112,6 +113,34 @@ class Speed:
         """0 before the second value."""
         (first_s, first), (last_s, last) = self._points[0], self._points[-1]
         return (last - first) / (last_s - first_s) if last_s > first_s else 0.0
+
+
+class Load:
+    """Load of the machine and of each node, ready for JSON; its meter is that of the run."""
+
+    def __init__(self, meter: LoadMeter) -> None:
+        self._meter = meter
+        self._speeds: defaultdict[str, Speed] = defaultdict(Speed)
+
+    def __call__(self) -> dict[str, Any]:
+        """Percent of a core, bytes and threads; the rest of the run's processes is this one."""
+        machine, groups, now_s = self._meter.machine(), self._meter.groups(), time.monotonic()
+        for name, load in groups.items():
+            self._speeds[name].add(now_s, load.cpu_s)
+        shown = {
+            "dashboard" if name == LAUNCHER else name: {
+                "cpu_percent": 100.0 * self._speeds[name].per_s,
+                "memory_bytes": load.memory_bytes,
+                "threads": load.threads,
+            }
+            for name, load in groups.items()
+        }
+        return {
+            "cores": list(machine.core_percent),
+            "memory_percent": machine.memory_percent,
+            "memory_used_bytes": machine.memory_used_bytes,
+            "groups": shown,
+        }
 
 
 class Loss:

@@ -10,7 +10,7 @@ import os
 import select
 import socket
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,10 +57,12 @@ def serve_dashboard() -> None:
 
 
 async def _serve(told: Mapping[str, Any], listening: socket.socket) -> None:
+    from neuros.api.observation import owner_of_processes
     from neuros.backends.control_sockets import connect_by
     from neuros.control import TO_OBSERVERS
     from neuros.control.link import ControlLink
-    from neuros_dashboard.live_metrics import ObservedRun
+    from neuros.recording.system_load import LoadMeter
+    from neuros_dashboard.live_metrics import Load, ObservedRun
     from neuros_dashboard.pages import Pages
     from neuros_dashboard.server import Dashboard
 
@@ -68,24 +70,10 @@ async def _serve(told: Mapping[str, Any], listening: socket.socket) -> None:
     link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
     run = ObservedRun(pages, link, names, told["start_s"])
     logs = {name: Path(path) for name, path in told["logs"].items()}
-    dashboard = Dashboard(told["plan"], lambda: _Log(logs), _load(told, names), pages, run)
-    await dashboard.serve(listening, told["token"], told["run"])
-
-
-def _load(told: Mapping[str, Any], names: tuple[str, ...]) -> Callable[[], Mapping[str, Any]]:
-    from neuros.api.observation import owner_of_processes
-    from neuros.recording.system_load import LAUNCHER, LoadMeter, LoadNow
-
     owner = owner_of_processes(told["run"], names, is_one_process=told["is_one_process"])
-    load_now = LoadNow(LoadMeter(owner))
-
-    def load() -> Mapping[str, Any]:
-        load = load_now()
-        # The rest of the run's processes is this one.
-        load["groups"]["dashboard"] = load["groups"].pop(LAUNCHER)
-        return load
-
-    return load
+    load = Load(LoadMeter(owner))
+    dashboard = Dashboard(told["plan"], lambda: _Log(logs), load, pages, run)
+    await dashboard.serve(listening, told["token"], told["run"])
 
 
 class _Log:

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 from msgspec.structs import replace
-from neuros_dashboard.live_metrics import LiveMetrics
+from neuros_dashboard.live_metrics import LiveMetrics, Load
 
 from neuros.control import LiveCounters, NodeStatus, Report
+from neuros.recording.system_load import LAUNCHER, GroupLoad, MachineLoad
 
 LINK = "a.o -> b.x"
 STATES = ("waiting", "blocked", "executing", "idle", "registering", "scheduling", "paused")
@@ -212,3 +213,25 @@ def test_after_the_end_counts_are_final_and_shares_those_of_the_run() -> None:
     reports["b"] = replace(reports["b"], is_final=False)
     figures.end(reports, 4.0, 0.25, has_drained=True)
     assert figures.connections[LINK]["lost"] is None
+
+
+class SteadyMeter:
+    cpu_s = 10.0
+
+    def machine(self) -> MachineLoad:
+        return MachineLoad((50.0, 20.0), 3_000, 40.0, 1, 2)
+
+    def groups(self) -> dict[str, GroupLoad]:
+        return {"robot": GroupLoad(self.cpu_s, 500, 7), LAUNCHER: GroupLoad(1.0, 900, 2)}
+
+
+def test_processor_time_is_that_since_the_last_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s, meter = [1.0], SteadyMeter()
+    monkeypatch.setattr("time.monotonic", lambda: now_s[0])
+    load = Load(meter)
+    assert load()["groups"]["robot"]["cpu_percent"] == 0.0
+    now_s[0], meter.cpu_s = 3.0, 11.0
+    shown = load()
+    assert shown["groups"]["robot"] == {"cpu_percent": 50.0, "memory_bytes": 500, "threads": 7}
+    assert shown["groups"]["dashboard"] == {"cpu_percent": 0.0, "memory_bytes": 900, "threads": 2}
+    assert shown["cores"] == [50.0, 20.0]

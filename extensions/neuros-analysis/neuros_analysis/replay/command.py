@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from neuros.api.run_record import PastRun
     from neuros.bag import RecordedTopic
     from neuros.hooks import HookSpec
-    from neuros.replay.node_replay import NodeVerdict
-    from neuros.replay.replayed_node import ReplayedNode
+    from neuros_analysis.replay.node_replay import NodeVerdict
+    from neuros_analysis.replay.replayed_node import ReplayedNode
 
 
 _LEAST_RATE, _LONGEST_DELAY_S = 1e-6, 1e6
@@ -166,7 +166,7 @@ def _replay(options: argparse.Namespace) -> int:
                 "replay: --topic publishes; --node, --jobs and --output run nodes: choose one"
             )
         return _publish(options)
-    from neuros.replay.recorded_node import recorded_run, require_end
+    from neuros_analysis.replay.recorded_node import recorded_run, require_end
 
     run = recorded_run(Path(options.run).absolute())
     require_end(run)
@@ -232,8 +232,8 @@ def _can_publish(topic: RecordedTopic, options: argparse.Namespace) -> bool:
 def _replay_bag(options: argparse.Namespace) -> int:
     """Give topics of a bag to a node of a project."""
     from neuros.bag import open_bag
-    from neuros.replay.bag_into_node import replay_into, rules_of
     from neuros.testing import PluginHarness
+    from neuros_analysis.replay.bag_into_node import replay_into, rules_of
 
     if len(options.nodes) != 1:
         raise UsageError("replay: --remap needs the node that gets the packets: one --node NAME")
@@ -278,7 +278,7 @@ def _replay_node(options: argparse.Namespace, run: PastRun) -> int:
         UsageError: if the node or the recording is not there.
         EnvironmentFault: if the node's Python cannot be made.
     """
-    from neuros.replay.node_replay import replay_of
+    from neuros_analysis.replay.node_replay import replay_of
 
     replay = replay_of(run, options.nodes[0])
     python, ended = replay.make_python()
@@ -299,7 +299,7 @@ def _replay_nodes(options: argparse.Namespace, run: PastRun) -> int:
     """
     from neuros.backends.node_command import usable_cores
     from neuros.cli.environments import signals_interrupt
-    from neuros.replay.whole_run import Replays, replays_of
+    from neuros_analysis.replay.whole_run import Replays, replays_of
 
     replays = replays_of(run, options.nodes or [*run.nodes])
     pythons = []
@@ -331,8 +331,8 @@ def _replay_nodes(options: argparse.Namespace, run: PastRun) -> int:
 
 
 def _show(verdicts: Sequence[NodeVerdict], run: PastRun, options: argparse.Namespace) -> None:
-    from neuros.replay.node_replay import IDENTICAL
-    from neuros.replay.recorded_node import is_cut_off
+    from neuros_analysis.replay.node_replay import IDENTICAL
+    from neuros_analysis.replay.recorded_node import is_cut_off
 
     notes = [f"{each.node}: {note}" for each in verdicts for note in each.notes]
     if is_cut_off(run):
@@ -367,10 +367,10 @@ def _replayed(options: argparse.Namespace) -> int:
     """The process that replays one node."""
     from neuros.project.split import node_file_from_json
     from neuros.recording.provenance import python_versions
-    from neuros.replay.from_container import note_on_versions, ran_in_container
-    from neuros.replay.node_replay import FAILED, NodeVerdict
-    from neuros.replay.recorded_node import RecordedNode, recorded_run
-    from neuros.replay.replayed_node import ReplayedNode, debugpy_on, files_changed_since
+    from neuros_analysis.replay.from_container import note_on_versions, ran_in_container
+    from neuros_analysis.replay.node_replay import FAILED, NodeVerdict
+    from neuros_analysis.replay.recorded_node import RecordedNode, recorded_run
+    from neuros_analysis.replay.replayed_node import ReplayedNode, debugpy_on, files_changed_since
 
     faulthandler.enable()
     os.environ.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
@@ -419,7 +419,7 @@ def _replayed(options: argparse.Namespace) -> int:
 
 def _run(node: ReplayedNode, *, use_pdb: bool) -> bool:
     """Replay the node; returns whether the user has left a debugger."""
-    from neuros.replay.replayed_node import Debugger, is_quit
+    from neuros_analysis.replay.replayed_node import Debugger, is_quit
 
     debugger = Debugger() if use_pdb else None
 
@@ -448,8 +448,8 @@ def _verdict(node: ReplayedNode, run: PastRun, name: str) -> NodeVerdict:
     Raises:
         EnvironmentFault: if a node that ran in a container lacks a module here.
     """
-    from neuros.replay.from_container import missing_module, not_here, ran_in_container
-    from neuros.replay.node_replay import DIFFERENT, IDENTICAL, UNKNOWN, NodeVerdict
+    from neuros_analysis.replay.from_container import missing_module, not_here, ran_in_container
+    from neuros_analysis.replay.node_replay import DIFFERENT, IDENTICAL, UNKNOWN, NodeVerdict
 
     difference = node.difference
     if node.failure is not None and difference is None:

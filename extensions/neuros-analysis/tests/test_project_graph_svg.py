@@ -7,12 +7,12 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from neuros_analysis.graph_picture import graph_svg
 
-from neuros.project.graph import graph_svg
 from neuros.project.load import load_project
 from neuros.project.model import Connection, Node, Port, Project
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 EXAMPLES, WORKSPACE = ROOT / "examples", ROOT / "workspace"
 TEXT = "std_msgs/msg/String"
 SVG = "{http://www.w3.org/2000/svg}"

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from neuros_analysis.graph_picture import Layout, lay_out
 from run_folders import wires
-
-from neuros.project.graph import Layout, lay_out
 
 
 def places_are_apart(layout: Layout) -> bool:

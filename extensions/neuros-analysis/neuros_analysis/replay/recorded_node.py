@@ -11,7 +11,6 @@ from typing import Any
 from neuros.api.packets import FOLDER, read_packets
 from neuros.api.run_record import PastRun, open_run
 from neuros.bag import Bag, open_bag
-from neuros.engine.event_log import callbacks_in, is_understood, is_whole
 from neuros.errors import EnvironmentFault, UsageError
 from neuros.ports import Way
 from neuros.project.model import Connection, NodeFile
@@ -20,6 +19,7 @@ from neuros.project.suggest import counted, did_you_mean
 from neuros.recording.recorder import repair
 from neuros.recording.recording_plan import RecordingPlan, load_plan
 from neuros.recording.run_file import read_node_file
+from neuros_analysis.replay.script import callbacks_in, is_understood, is_whole
 
 _RECORD = "run the project again with -r (--record), and replay that run"
 
@@ -90,7 +90,7 @@ class RecordedNode:
     """The packets of one node, from the bag of a run.
 
     Attributes:
-        event_log: events of its engine (:mod:`neuros.engine.event_log`).
+        event_log: events of its engine (:mod:`neuros_analysis.replay.script`).
         is_whole: whether these reach the end of the node.
         plan: of the recording.
 

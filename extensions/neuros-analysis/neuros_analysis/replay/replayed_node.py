@@ -17,13 +17,6 @@ from typing import Any, TypeAlias
 
 from neuros.api.verify import differing_fields
 from neuros.engine.engine import Engine
-from neuros.engine.event_log import (
-    Player,
-    ReplayedEngine,
-    ReplayOver,
-    ReplayParted,
-    Script,
-)
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
 from neuros.hooks import HookSpec
 from neuros.node.context import ContextSwitch
@@ -31,12 +24,19 @@ from neuros.node.node import NodeRuntime
 from neuros.ports import Advance, Inbox, Way
 from neuros.project.model import Connection, NodeFile
 from neuros.project.timing import REAL
-from neuros.replay.recorded_node import RecordedNode
 from neuros.runtime.local import LocalLoop, LocalMiddleware, NoTopics
 from neuros.transport.envelope import Traffic
 from neuros.transport.memory import MemoryTransport
 from neuros.transport.messages import RosPackets
 from neuros.transport.ros_loop import RosLoop
+from neuros_analysis.replay.recorded_node import RecordedNode
+from neuros_analysis.replay.script import (
+    Player,
+    ReplayedEngine,
+    ReplayOver,
+    ReplayParted,
+    Script,
+)
 
 _POLL_S = 0.1
 _DEBUGPY_HOST = "127.0.0.1"

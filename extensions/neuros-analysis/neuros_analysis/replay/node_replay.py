@@ -34,8 +34,8 @@ from neuros.project.model import NodeFile
 from neuros.project.split import node_file_text
 from neuros.recording.run_file import read_object
 from neuros.registry import ran_in_one_process
-from neuros.replay.from_container import as_on_this_machine, not_here, ran_in_container
-from neuros.replay.recorded_node import RecordedNode, recorded_node
+from neuros_analysis.replay.from_container import as_on_this_machine, not_here, ran_in_container
+from neuros_analysis.replay.recorded_node import RecordedNode, recorded_node
 
 IDENTICAL, DIFFERENT, UNKNOWN, FAILED = "identical", "different", "unknown", "not replayed"
 

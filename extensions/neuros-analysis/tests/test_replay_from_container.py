@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from neuros_analysis.replay.from_container import note_on_versions
+
 from neuros.api.run_record import PastRun
-from neuros.replay.from_container import note_on_versions
 
 
 def versions(python: str = "3.11.2", **packages: str) -> dict[str, Any]:

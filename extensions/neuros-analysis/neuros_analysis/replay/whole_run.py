@@ -10,7 +10,7 @@ from pathlib import Path
 from neuros.api.run_record import PastRun
 from neuros.backends.node_command import signal_in_words
 from neuros.errors import EnvironmentFault, NeurosError, UsageError
-from neuros.replay.node_replay import FAILED, NodeReplay, NodeVerdict, replay_of
+from neuros_analysis.replay.node_replay import FAILED, NodeReplay, NodeVerdict, replay_of
 
 _TAIL_LINES = 20
 _END_S = 5.0

@@ -1,4 +1,4 @@
-"""``neuros fork``: a run executed again up to a moment, which goes on with a change there."""
+"""``neuros fork``; ``--help`` and completion read this module, too."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def add_fork(fork: argparse.ArgumentParser) -> None:
 
 def _fork(options: argparse.Namespace) -> int:
     from neuros.api.changes import settings_of
-    from neuros.api.forking import fork_run, moment
     from neuros.cli.environments import signals_interrupt
+    from neuros_analysis.forking import fork_run, moment
 
     at_s, _ = moment(options.at)
     settings = settings_of(options.set)
