@@ -88,7 +88,7 @@ class Live:
             raise RuntimeError(f"the project has ended:\n{self.output.read_text()}")
 
     def processes(self) -> list[psutil.Process]:
-        """The launcher and all that it has started, its reaper included."""
+        """The launcher and all that it has started, its guardian included."""
         return [self.launcher, *self.launcher.children(recursive=True)]
 
     def host_of(self, name: str) -> psutil.Process:
@@ -135,7 +135,7 @@ def live(
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """End a launcher, which ends its nodes; were it killed, its reaper would."""
+    """End a launcher, which ends its nodes; were it killed, its guardian would."""
     process.terminate()
     try:
         process.wait(_END_S)

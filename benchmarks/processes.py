@@ -14,8 +14,8 @@ from typing import IO
 from benchmarks.machine import ROOT
 from benchmarks.measure import Unavailable
 from neuros.backends.domain import choose_domain
+from neuros.backends.guardian_program import children_on
 from neuros.backends.node_command import usable_cores
-from neuros.backends.reaper_program import children_on
 
 END_S = 5.0
 

@@ -577,7 +577,7 @@ class ChildProcess(Protocol):
         """Signal the process, or its process group; does nothing after the end."""
 
 
-class Reaper(Protocol):
+class Guardian(Protocol):
     """Cleans up a run after the end of its launcher, even by SIGKILL."""
 
     def spawn(
@@ -594,7 +594,7 @@ class Reaper(Protocol):
         """
 
     def watch(self, pid: int) -> None:
-        """Register another process, which leads its own session."""
+        """Register another process, which does not have the run's id in its environment."""
 
     def remove_later(self, path: Path) -> None:
         """Remove a file, socket or folder once all processes of the run are gone."""
@@ -616,7 +616,7 @@ class NodeProgram:
         options: of the program, as ``--debug``.
         cores: by node, the cores that it may use; other nodes may use any.
         pythons: by node, the Python that it needs in place of this one.
-        reaper: of the run; ``None`` if it starts nothing.
+        guardian: of the run; ``None`` if it starts nothing.
         environ: the environment of the launcher.
         is_isolated: whether the nodes have a network of their own.
         program: the command without options and paths of ``node.json`` files.
@@ -625,7 +625,7 @@ class NodeProgram:
     options: Sequence[str] = ()
     cores: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     pythons: Mapping[str, Path] = field(default_factory=dict)
-    reaper: Reaper | None = None
+    guardian: Guardian | None = None
     environ: Mapping[str, str] = field(default_factory=dict)
     is_isolated: bool = False
     program: Sequence[str] = field(default_factory=lambda: python_command("neuros.cli", "node"))
@@ -770,7 +770,7 @@ class Shown:
 class View(Protocol):
     """A view of a running run."""
 
-    def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None:
+    def start(self, run: Shown, guardian: Guardian, log: Callable[[str, str], None]) -> None:
         """Open the view, once there is a control socket; ``log`` takes ``(severity, text)``.
 
         Raises ``EnvironmentFault``.
@@ -977,6 +977,7 @@ class BackEnd(ABC):
         has_own_pythons: whether nodes run on Pythons of the back end (those of images).
         has_own_network: whether the back end makes the network of an isolated run, in place of the
             launcher.
+        is_forked: whether the guardian starts its node processes, so that it may fork them.
     """
 
     name: str
@@ -985,7 +986,7 @@ class BackEnd(ABC):
     options: Sequence[Option] = ()
     transport = "ros"
     is_one_process = False
-    has_own_pythons = has_own_network = False
+    has_own_pythons = has_own_network = is_forked = False
 
     @abstractmethod
     def prepare(

@@ -131,8 +131,8 @@ def threads_of(pid: int) -> ProcessThreads:
 def allow_reading() -> None:
     """Let :func:`threads_of` read this process although Yama allows ancestors only.
 
-    The launcher and its children may: the launcher starts the reaper, which starts this process. In
-    a container, where the launcher is invisible, any process of the same user may.
+    The launcher and its children may: the launcher starts the guardian, which starts this process.
+    In a container, where the launcher is invisible, any process of the same user may.
     """
     reader = _ANY
     with contextlib.suppress(OSError), open(f"/proc/{os.getppid()}/stat", "rb") as file:

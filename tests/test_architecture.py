@@ -319,19 +319,6 @@ def test_the_command_line_starts_without_what_single_commands_need() -> None:
     )
 
 
-def test_the_reaper_starts_without_what_takes_long_to_import() -> None:
-    """Each launch starts one."""
-    isolated_without_packages = "-IS"
-    run_python(
-        isolated_without_packages,
-        "-c",
-        "import sys; sys.path.insert(0, '.'); import neuros.backends.reaper_program as program\n"
-        "program._import_the_rest()\n"
-        "assert 'neuros.backends.shared_memory' in sys.modules\n"
-        "assert not {'dataclasses', 'inspect', 'tempfile'} & {*sys.modules}",
-    )
-
-
 def ends_or_evaluates(tree: ast.Module) -> Iterator[tuple[int, str]]:
     """Calls that a library must not make: it would end the process, or run text as code."""
     banned = {"eval", "exec", "exit", "quit", "sys.exit"}

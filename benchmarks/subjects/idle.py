@@ -1,6 +1,6 @@
 """What a project costs that has nothing to do: processor time of all its processes.
 
-Launcher, reaper and nodes, in user space and in the kernel, as a share of one core. The three
+Launcher, guardian and nodes, in user space and in the kernel, as a share of one core. The three
 kinds run at the same time: each process's own time is counted, and they hardly use any.
 """
 

@@ -37,11 +37,11 @@ from neuros.backends.console import (
 )
 from neuros.backends.control_sockets import UnixListener
 from neuros.backends.domain import DomainLock, choose_domain
+from neuros.backends.guardian import Guardian, start_guardian
 from neuros.backends.node_command import with_messages
 from neuros.backends.portable import common_variables
 from neuros.backends.process_launchers import WITHOUT_ROS
-from neuros.backends.reaper import Reaper
-from neuros.backends.sessions import RunOnThisMachine, reaper_environment, this_process
+from neuros.backends.sessions import RunOnThisMachine, mark, this_process
 from neuros.backends.sidecars import Recorded
 from neuros.control import CONTROL_VARIABLE, ELSEWHERE_VARIABLE
 from neuros.errors import EnvironmentFault, UsageError, printable
@@ -65,6 +65,7 @@ class Execution:
         waker: bytes arrive here with each signal and each wish.
         wishes: reason and exit code of each end that this program asks for.
         views: viewers that show the run while it goes on.
+        guardian: the one of the run, if it has been started.
 
     Raises:
         UsageError: if the run folder, the domain or the recording is impossible.
@@ -79,14 +80,17 @@ class Execution:
         waker: socket.socket,
         wishes: list[tuple[str, int]] | None = None,
         views: Sequence[View] = (),
+        guardian: Guardian | None = None,
     ) -> None:
         self._plan = plan
         self._signals = signals
         self._waker = waker
         self._wishes = wishes
         self._views = views
-        self._run_id = os.urandom(8).hex()
+        self._guardian = guardian or start_guardian(plan.back_end)
+        self._run_id = self._guardian.run_id
         with contextlib.ExitStack() as stack:
+            stack.callback(self._guardian.finish)
             stack.callback(plan.deployment.finish, lambda: True)
             self._recording_plan = recording_of(plan, os.environ)
             listened = self._recording_plan.listen if self._recording_plan else ()
@@ -131,6 +135,7 @@ class Execution:
         """Release what the run holds, in place of :meth:`run`."""
         self._plan.deployment.finish(lambda: True)
         self._domain.release()
+        self._guardian.finish()
 
     def run(self) -> dict[str, Any]:
         """Start, supervise, clean up, report; returns the content of ``run.json``.
@@ -141,14 +146,26 @@ class Execution:
         started = time.time()
         with contextlib.ExitStack() as stack:
             stack.callback(self._domain.release)
-            environment = reaper_environment(self._session(started))
-            reaper = Reaper.start(self._run_id, self._domain, environment)
-            stack.callback(reaper.finish)
+            guardian = self._guardian
+            stack.callback(guardian.finish)
+            guardian.await_ready()
+            if self._plan.back_end.is_forked:
+                messages = self._plan.messages
+                ports = [port for f in self._files for port in (*f.node.inputs, *f.node.outputs)]
+                packages = sorted({port.ros_type.partition("/")[0] for port in ports})
+                guardian.import_early(
+                    *([f"{package}.msg"] for package in packages),
+                    folders=messages.paths if messages else (),
+                )
+            its_mark = mark(self._session(started))
+            stack.callback(its_mark.release)
+            for lock in (self._domain, its_mark):
+                guardian.hold(lock)
             for file in self._listener.files:
-                reaper.remove_later(file)
-            return self._run(reaper, started)
+                guardian.remove_later(file)
+            return self._run(guardian, started)
 
-    def _run(self, reaper: Reaper, started: float) -> dict[str, Any]:
+    def _run(self, guardian: Guardian, started: float) -> dict[str, Any]:
         started_s = time.monotonic()
         observation = Observation(self._plan, self._run_id, self.folder)
         outcome = Outcome(exit_code=1, reason="the launcher failed", ended_s=started_s)
@@ -164,14 +181,14 @@ class Execution:
                 self._console.log(severity, notice)
             if self._recording_plan is not None:
                 recording = Recording(
-                    self._recording_plan, self._run_id, self.folder, self._beside(), reaper
+                    self._recording_plan, self._run_id, self.folder, self._beside()
                 )
-            supervisor = self._supervisor(reaper)
+            supervisor = self._supervisor(guardian)
             outcome = supervisor.outcome
             duration = self._plan.request.end
             self._console.follow(Progress(outcome, duration.wall_s, duration.sim_s))
             for view in self._views:
-                view.start(self._shown(), reaper, self._console.log)
+                view.start(self._shown(), guardian, self._console.log)
             supervisor.run()
         except BaseException as error:  # for run.json; the command line shows the error
             outcome.exit_code = EXIT_ENVIRONMENT if isinstance(error, EnvironmentFault) else 1
@@ -179,13 +196,13 @@ class Execution:
             raise
         finally:
             recorded, observed = self._stop(outcome, recording, observation)
-            if not reaper.is_on_duty:
-                self._console.log("WARN", "the reaper was killed: the launcher does its work")
-            reaper.leave()  # it works while the record is made
+            if not guardian.is_on_duty:
+                self._console.log("WARN", "the guardian was killed: the launcher does its work")
+            guardian.leave()  # it works while the record is made
             # A user who has ended the run does not wait for a reader that does not read.
             self._console.finish(_PATIENCE_S if outcome.is_signalled else None)
             record = self._record(outcome, observed, started, started_s)
-            reaper.finish()
+            guardian.finish()
             if recording is not None and recorded is not None:
                 for problem in recording.report(recorded, record):
                     outcome.fail(problem, EXIT_ENVIRONMENT)
@@ -289,7 +306,7 @@ class Execution:
             elsewhere=self._plan.places,
         )
 
-    def _supervisor(self, reaper: Reaper) -> Supervisor:
+    def _supervisor(self, guardian: Guardian) -> Supervisor:
         namespace = self._plan.project.names.namespace
         options = [f"-d {self._domain.id}"]
         options += [f"--namespace {namespace}"] if namespace else []
@@ -297,7 +314,7 @@ class Execution:
         how = f" (started by -n, with the same nodes and connections, {' and '.join(options)})"
         return Supervisor(
             self._files,
-            self._plan.launcher(reaper),
+            self._plan.launcher(guardian),
             self._environment(),
             self.folder,
             self._console,

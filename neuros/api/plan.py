@@ -16,11 +16,11 @@ from typing import Any
 
 from neuros.api.kept import Sources, find_sources, given_sources
 from neuros.api.request import Duration, Request
+from neuros.backends.guardian import Guardian
 from neuros.backends.node_command import place, usable_cores, without_mark
 from neuros.backends.portable import portable_project
 from neuros.backends.process_launchers import VIRTUAL_ROS, WITHOUT_ROS
 from neuros.backends.pythons import Pythons, require_one_python
-from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, Problem, ProjectError, UsageError, printable
@@ -214,8 +214,8 @@ class Plan:
             if f.node.name in self.names
         ]
 
-    def launcher(self, reaper: Reaper | None = None) -> Launcher:
-        """The launcher of the back end; it reports its processes to ``reaper``."""
+    def launcher(self, guardian: Guardian | None = None) -> Launcher:
+        """The launcher of the back end; it reports its processes to ``guardian``."""
         transport = self.deployment.transport or self.back_end.transport
         end, is_virtual = self.request.end, self.project.is_virtual
         if is_virtual:
@@ -244,7 +244,7 @@ class Plan:
                 options,
                 place(self.nodes) if self.request.placement else {},
                 self.pythons.paths,
-                reaper,
+                guardian,
                 as_asked(os.environ),
                 self.request.isolate,
             )
@@ -445,16 +445,17 @@ def make_environments(pythons: Pythons, messages: Messages | None, output: Strea
         messages.record_use()
     if are_made(pythons, messages):
         return
-    # The reaper ends pip, the compiler, and their children when the launcher is killed.
+    # The guardian ends pip, the compiler, and their children when the launcher is killed.
     run_id = os.urandom(8).hex()
-    reaper = Reaper.start(run_id)
+    guardian = Guardian.start(run_id)
+    guardian.await_ready()
     try:
         progress = Progress(output)
         if messages is not None:
             messages.make(progress, {**without_mark(os.environ), RUN_ID: run_id})
         pythons.make(progress, {RUN_ID: run_id})
     finally:
-        reaper.finish()
+        guardian.finish()
 
 
 def are_made(pythons: Pythons, messages: Messages | None) -> bool:

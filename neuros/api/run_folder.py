@@ -33,7 +33,6 @@ from neuros.api.kept import copy_sources
 from neuros.api.plan import Plan
 from neuros.api.plugin_text import PluginText
 from neuros.api.run_record import EXIT_ENVIRONMENT
-from neuros.backends.reaper import Reaper
 from neuros.backends.sidecars import Recorded, RecorderProcess
 from neuros.distribution import WORKSPACE, __version__, python_command
 from neuros.errors import UsageError
@@ -188,7 +187,6 @@ class Recording:
         run_id: str,
         run: Path,
         environment: Mapping[str, str],
-        reaper: Reaper,
     ) -> None:
         self._plan = replace(plan, custom={**plan.custom, "run_id": run_id})
         self._run = run
@@ -196,7 +194,6 @@ class Recording:
             self._plan.save(run)
         command = python_command("neuros.cli", "recorder", str(run))
         self._process = RecorderProcess(command, run, log_of(run), environment)
-        reaper.watch(self._process.pid)
 
     def finish(self, signals: Sequence[int]) -> Recorded:
         """Complete the bag; a further signal ends that."""

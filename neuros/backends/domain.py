@@ -1,9 +1,9 @@
 """Chooses the ROS domain of a run, and locks it against other runs.
 
 A run locks the file ``neuros-domain-<id>.lock`` in the temporary folder of the machine (``flock``).
-The lock ends with the launcher and its reaper, which inherits it, also by SIGKILL. Runs that chose
-the first free domain hold it exclusively; runs that were given a domain share it, so that they may
-join each other and no other run chooses it.
+The lock ends with the launcher and its guardian, which hold it both, also by SIGKILL. Runs that
+chose the first free domain hold it exclusively; runs that were given a domain share it, so that
+they may join each other and no other run chooses it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
-from neuros.backends.reaper_program import is_same_file, remove_lock
+from neuros.backends.guardian_program import is_same_file, remove_lock
 from neuros.errors import EnvironmentFault, UsageError
 
 AUTOMATIC = range(1, 102)
@@ -24,32 +24,42 @@ _HIGHEST = 232
 _UDP_TABLES = (Path("/proc/net/udp"), Path("/proc/net/udp6"))
 
 
-class DomainLock:
-    """A ROS domain, held while this is open.
+class FileLock:
+    """A locked file.
 
     Attributes:
-        id: the domain id.
-        reason: what to print, "ROS domain 7 (first free)".
-        path: the lock file, or ``None`` if there is none; removed on release.
+        path: the file, or ``None`` if there is none; removed on release.
     """
 
-    def __init__(self, domain: int, reason: str, lock: tuple[Path, int] | None = None) -> None:
-        self.id = domain
-        self.reason = f"ROS domain {domain} ({reason})"
+    def __init__(self, lock: tuple[Path, int] | None = None) -> None:
         self.path: Path | None = lock[0] if lock else None
         self._descriptor: int | None = lock[1] if lock else None
 
     def fileno(self) -> int | None:
-        """The locked file descriptor, which the reaper holds as well; ``None`` without lock."""
+        """The locked file descriptor, which the guardian holds as well; ``None`` without lock."""
         return self._descriptor
 
     def release(self) -> None:
-        """Unlock the domain; a second call has no effect."""
+        """Unlock the file; a second call has no effect."""
         if self._descriptor is None or self.path is None:
             return
         remove_lock(self._descriptor, self.path)
         os.close(self._descriptor)
         self._descriptor = None
+
+
+class DomainLock(FileLock):
+    """A ROS domain, held while this is open.
+
+    Attributes:
+        id: the domain id.
+        reason: what to print, "ROS domain 7 (first free)".
+    """
+
+    def __init__(self, domain: int, reason: str, lock: tuple[Path, int] | None = None) -> None:
+        super().__init__(lock)
+        self.id = domain
+        self.reason = f"ROS domain {domain} ({reason})"
 
     def __enter__(self) -> DomainLock:
         return self

@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from neuros.backends.guardian import UNKNOWN
 from neuros.backends.node_command import (
     PROCESS_LOG,
     NodeProcess,
@@ -19,10 +20,9 @@ from neuros.backends.node_command import (
     script_failure,
     signal_in_words,
 )
-from neuros.backends.reaper import UNKNOWN
 from neuros.errors import EnvironmentFault
 from neuros.options import Option
-from neuros.ports import BackEnd, Deployment, Launcher, NodeProgram, Reaper
+from neuros.ports import BackEnd, Deployment, Guardian, Launcher, NodeProgram
 from neuros.project.model import Node, NodeFile, Project
 from neuros.stacks import ProcessThreads, threads_of
 
@@ -39,6 +39,7 @@ class ProcessBackEnd(BackEnd):
     name = "process"
     place = "a process"
     rank = 0
+    is_forked = True
 
     def prepare(
         self, project: Project, nodes: Sequence[Node], options: Mapping[str, Any]
@@ -52,7 +53,7 @@ class InProcessBackEnd(BackEnd):
     name = "in-process"
     place = "one process with all others"
     transport = "memory"
-    is_one_process = True
+    is_one_process = is_forked = True
     options = (
         Option(
             ("--no-ros",),
@@ -120,8 +121,8 @@ class ProcessLauncher:
         started: list[RunningProcess] = []
         try:
             for process in self._processes(nodes, environment):
-                assert self._program.reaper is not None
-                started.append(RunningProcess(process, self._program.reaper))
+                assert self._program.guardian is not None
+                started.append(RunningProcess(process, self._program.guardian))
         except BaseException:
             end_now(started)
             raise
@@ -159,13 +160,13 @@ class RunningProcess:
 
     is_abandoned = False
 
-    def __init__(self, process: NodeProcess, reaper: Reaper) -> None:
+    def __init__(self, process: NodeProcess, guardian: Guardian) -> None:
         """Start the process. Raises ``EnvironmentFault``."""
         self.names = process.names
         self._log = process.log
         try:
             process.log.parent.mkdir(parents=True, exist_ok=True)
-            self._process = reaper.spawn(
+            self._process = guardian.spawn(
                 process.command, process.log, process.folder, process.environment, process.cores
             )
         except OSError as error:
@@ -179,7 +180,7 @@ class RunningProcess:
         if code is None:
             return None
         if code == UNKNOWN:
-            return "how is not known, since the reaper was killed"
+            return "how is not known, since the guardian was killed"
         if code < 0:
             return signal_in_words(-code)
         return (script_failure(self._log) if code == 1 else None) or f"exit code {code}"

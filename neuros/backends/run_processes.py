@@ -1,81 +1,43 @@
-"""Processes of a run on this machine, read from ``/proc``.
+"""Processes of this machine, read from ``/proc``, and what a process shows of itself there.
 
-Standard library only: the reaper runs this.
+Standard library only: the guardian runs this.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
-from collections.abc import Iterator
+import struct
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 RUN_ID = "NEUROS_RUN_ID"
 """The environment variable that every process of a run inherits."""
 
 _NODE_FOLDER = b"NEUROS_RUN_DIR="
+_PR_SET_MM, _PR_SET_MM_MAP = 35, 14
 
 
-class _Process(NamedTuple):  # a dataclass would take the reaper 10 ms to import
+class _Process(NamedTuple):
     """One line of ``/proc/<pid>/stat``; ``start`` (clock ticks) tells it from a later namesake."""
 
     pid: int
     parent: int
-    session: int
     start: int
     is_gone: bool
 
 
 class RunProcesses:
-    """The processes of one run, without this process.
+    """The processes of one run, by the run's id in their environment, without this process."""
 
-    A process stays known when it is ending and its environment can no longer be read.
-
-    Args:
-        ancestor: a process whose descendants belong to the run, too.
-    """
-
-    def __init__(self, run_id: str, ancestor: int = -1) -> None:
-        self._ancestor = ancestor
+    def __init__(self, run_id: str) -> None:
         self._mark = f"{RUN_ID}={run_id}".encode()
-        self._sessions: dict[int, int] = {}
-        self._known: dict[int, int] = {}
 
-    def add_session(self, pid: int) -> None:
-        """Add all processes of the session that ``pid`` leads."""
-        process = _read(pid)
-        # A node process that has ended already may have left children in its session.
-        self._sessions[pid] = process.start if process else -1
-
-    def alive(self) -> dict[int, int]:
-        """Process ids and start times of all processes but zombies."""
-        processes = {process.pid: process for process in _all()}
-        processes.pop(os.getpid(), None)
-        members = set()
-        for pid, process in processes.items():
-            leader, start = processes.get(process.session), self._sessions.get(process.session)
-            if (
-                self._known.get(pid) == process.start
-                or process.parent == self._ancestor
-                # While a session has members, the number of its dead leader is not given out again.
-                or (start is not None and (leader is None or leader.start == start))
-                or self._mark in environ_of(pid)
-            ):
-                members.add(pid)
-        while children := {
-            pid
-            for pid, process in processes.items()
-            if process.parent in members and pid not in members
-        }:
-            members |= children
-        self._known = {}
-        for pid in members:
-            # Some are gone by now, or have become another user's (sudo).
-            with contextlib.suppress(OSError):
-                os.kill(pid, 0)
-                if not processes[pid].is_gone:
-                    self._known[pid] = processes[pid].start
-        return dict(self._known)
+    def alive(self) -> list[int]:
+        """Process ids."""
+        others = (int(name) for name in _numbers() if int(name) != os.getpid())
+        return [pid for pid in others if self._mark in environ_of(pid) and started_at(pid)]
 
     def nodes(self) -> dict[int, str]:
         """Process ids of processes that were started for one node, and the name of the node."""
@@ -85,6 +47,18 @@ class RunProcesses:
                 if variable.startswith(_NODE_FOLDER):
                     found[pid] = os.fsdecode(variable.rpartition(b"/")[2])
         return found
+
+
+def children() -> list[int]:
+    """Process ids of the children of this process, but for zombies and other users' (sudo)."""
+    found = []
+    for name in _numbers():
+        process = _read(int(name))
+        if process and process.parent == os.getpid() and not process.is_gone:
+            with contextlib.suppress(OSError):  # it may be gone by now
+                os.kill(process.pid, 0)
+                found.append(process.pid)
+    return found
 
 
 def environ_of(pid: int) -> list[bytes]:
@@ -100,10 +74,40 @@ def started_at(pid: int) -> int | None:
     return None if process is None or process.is_gone else process.start
 
 
-def _all() -> Iterator[_Process]:
-    for name in filter(str.isdigit, os.listdir("/proc")):
-        if process := _read(int(name)):
-            yield process
+def show_as(command: Sequence[str], environment: Mapping[str, str]) -> bool:
+    """Show a command and an environment in ``/proc`` as this process's own; False: impossible.
+
+    It is what ``execve`` does for a program: tools such as ``ps`` read nothing else. Linux lets
+    any process do it (``PR_SET_MM_MAP``, prctl(2)), unless it was built without.
+    """
+    words = b"".join(os.fsencode(word) + b"\0" for word in command)
+    variables = b"".join(os.fsencode(f"{k}={v}") + b"\0" for k, v in environment.items())
+    shown = ctypes.create_string_buffer(words + variables)
+    start = ctypes.addressof(shown)
+    arguments = start, start + len(words)
+    libc = ctypes.CDLL(None, use_errno=True)
+    libc.sbrk.restype = ctypes.c_void_p
+    with open("/proc/self/stat", "rb") as file:
+        text = file.read()
+    # The fields from the third one on, by their numbers in proc(5).
+    field = dict(enumerate(map(int, text[text.rindex(b")") + 4 :].split()), 4))
+    code, data = (field[26], field[27]), (field[45], field[46])
+    heap = field[47], libc.sbrk(0)
+    # struct prctl_mm_map of <linux/prctl.h>, with auxiliary vector and program as they are.
+    places = *code, *data, *heap, field[28], *arguments, arguments[1], start + len(shown) - 1
+    given = struct.pack("11QQII", *places, 0, 0, 0xFFFFFFFF)
+    size = ctypes.c_ulong(len(given))
+    is_shown = bool(libc.prctl(_PR_SET_MM, _PR_SET_MM_MAP, given, size, 0) == 0)
+    if is_shown:
+        _SHOWN.append(shown)  # the kernel reads it there from now on
+    return is_shown
+
+
+_SHOWN: list[object] = []
+
+
+def _numbers() -> Iterator[str]:
+    return filter(str.isdigit, os.listdir("/proc"))
 
 
 def _read(pid: int) -> _Process | None:
@@ -112,9 +116,9 @@ def _read(pid: int) -> _Process | None:
             text = file.read()
     except OSError:
         return None
-    # pid (name) state ppid pgrp session ...; the name may hold spaces and brackets (proc(5))
+    # pid (name) state ppid ...; the name may hold spaces and brackets (proc(5))
     fields = text[text.rindex(b")") + 2 :].split()
     state, threads = fields[0], int(fields[17])
     # A dead main thread makes a zombie of the process while other threads still run.
     is_gone = state in (b"Z", b"X") and threads <= 1
-    return _Process(pid, int(fields[1]), int(fields[3]), int(fields[19]), is_gone)
+    return _Process(pid, int(fields[1]), int(fields[19]), is_gone)

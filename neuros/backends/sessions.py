@@ -1,27 +1,31 @@
 """Runs on this machine that this user may see: its own, or all for root.
 
-Each run has a reaper from before its first process until after its last, so the reapers tell the
-runs, and no file can be out of date. The environment of a reaper describes its run; only its user
-can read that.
+Each run has a mark, a file in ``/dev/shm`` that describes it and that only its user can read. The
+launcher and the guardian of the run have the file locked (``flock``) from before the first process
+of the run until after the last, so a mark that is left by a killed run is not taken for a run.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import signal
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 
 from neuros.backends.console import clean
 from neuros.backends.control_sockets import connect
-from neuros.backends.run_processes import RunProcesses, environ_of, started_at
+from neuros.backends.domain import FileLock
+from neuros.backends.run_processes import RunProcesses, started_at
+from neuros.backends.shared_memory import MARK, read_if_held
 from neuros.control import TO_OBSERVERS, Interrupt, Watch
 from neuros.control.link import ControlLink, read_as, with_texts
 from neuros.errors import ControlError, EnvironmentFault
 
-_VARIABLE = "NEUROS_GUARDED_RUN"
+_FOLDER = Path("/dev/shm")
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class RunOnThisMachine:
             same number.
         control: address of its control channel.
         elsewhere: the machine of each node that runs on another one.
-        user: number of the user, which is that of the reaper.
+        user: number of the user, which is that of the mark's owner.
     """
 
     run: str
@@ -61,7 +65,7 @@ class RunOnThisMachine:
 
     @property
     def is_led(self) -> bool:
-        """Whether its launcher runs; if not, the reaper is ending the run."""
+        """Whether its launcher runs; if not, the guardian is ending the run."""
         pid, start = self.launcher
         return started_at(pid) == start and _user_of(pid) == self.user
 
@@ -94,9 +98,17 @@ class RunOnThisMachine:
             link.close()
 
 
-def reaper_environment(session: RunOnThisMachine) -> dict[str, str]:
-    """Environment of the reaper of a run."""
-    return {_VARIABLE: json.dumps(asdict(session))}
+def mark(session: RunOnThisMachine) -> FileLock:
+    """Make the mark of a run; without shared memory there is none, and ``neuros ps`` shows none."""
+    path = _FOLDER / f"neuros_{session.run}{MARK}"
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except OSError:
+        return FileLock()
+    fcntl.flock(descriptor, fcntl.LOCK_SH)
+    with contextlib.suppress(OSError), open(descriptor, "w", closefd=False) as file:
+        json.dump(asdict(session), file)
+    return FileLock((path, descriptor))
 
 
 def this_process() -> tuple[int, int]:
@@ -110,17 +122,14 @@ def sessions() -> list[RunOnThisMachine]:
 
 
 def _found() -> Iterator[RunOnThisMachine]:
-    mark = f"{_VARIABLE}=".encode()
-    for name in filter(str.isdigit, os.listdir("/proc")):
-        for variable in environ_of(int(name)):
-            if variable.startswith(mark):
-                # Another version of NeuROS, or another user, may have written anything there,
-                # control sequences of terminals too.
-                with contextlib.suppress(ControlError, ValueError, TypeError, RecursionError):
-                    described = json.loads(variable.removeprefix(mark))
-                    described |= {"user": _user_of(int(name))}
-                    described = with_texts(described, lambda text: clean(text, keep_colours=False))
-                    yield read_as(RunOnThisMachine, described)
+    for path in _FOLDER.glob(f"neuros_*{MARK}"):
+        # Another version of NeuROS, or another user, may have written anything there, control
+        # sequences of terminals too.
+        with contextlib.suppress(OSError, ControlError, ValueError, TypeError, RecursionError):
+            described = json.loads(read_if_held(path) or b"")
+            described |= {"user": path.lstat().st_uid}
+            described = with_texts(described, lambda text: clean(text, keep_colours=False))
+            yield read_as(RunOnThisMachine, described)
 
 
 def _user_of(pid: int) -> int | None:

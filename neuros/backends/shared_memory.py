@@ -18,28 +18,25 @@ with LTTng; it goes when nobody maps it, and the next process makes it anew.
 ``neuros_<run id>_...`` holds the large packets of a run's nodes. Once the processes of that run are
 gone it goes, and only then: the name says whose it is.
 
-Where launcher and reaper were both killed, the next run removes ``neuros_<run id>_...`` and
+Where launcher and guardian were both killed, the next run removes ``neuros_<run id>_...`` and
 ``neuros_<run id>``, the folder that containers share, and so does ``neuros stop``. A living owner,
-the launcher or the sender, has them locked (``flock``); locks are seen from everywhere, also where
-processes are not (from within a container). Nodes may live on for some seconds.
+the launcher or the sender, has them locked (``flock``), and so is the mark of a living run; locks
+are seen from everywhere, also where processes are not (from within a container).
 
-Standard library only: the reaper runs this.
+Standard library only: the guardian runs this.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
-import functools
 import os
 import re
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
-
-from neuros.backends.run_processes import RunProcesses
 
 _FAST_DDS = re.compile(
     r"(?:sem\.)?(?P<base>fast(?:rtps|dds|_datasharing)_.+?)(?P<part>_el|_sl|_mutex)?"
@@ -50,6 +47,8 @@ _LOCKS = ("_el", "_sl")
 _CLOCK_SLACK_S = 0.05
 _NAME = re.compile(r"neuros_(?P<run>[0-9a-f]{16})(?:_.*)?")
 _LOOK_AGAIN_S = 0.1
+MARK = "_mark"
+"""End of the name of the file that marks a run while it is locked."""
 _MOST_LOOKS = 20
 _Files: TypeAlias = "tuple[tuple[str, int], ...]"  # names and inodes: they live and die together
 
@@ -82,7 +81,7 @@ def sweep(
     return tuple(removed)
 
 
-class _Found(NamedTuple):  # a dataclass would take the reaper 10 ms to import
+class _Found(NamedTuple):
     files: dict[str, os.stat_result]
     locks: list[str]
 
@@ -170,25 +169,41 @@ def remove_dead_runs(
 
 
 def _dead(folder: Path) -> dict[str, int]:
-    """Names and inodes without a lock, of runs without processes."""
+    """Names and inodes without a lock, of runs whose mark has none."""
     found: dict[str, int] = {}
-    is_alive = functools.cache(lambda run: bool(RunProcesses(run).alive()))
     for name in os.listdir(folder) if folder.is_dir() else ():
         match = _NAME.fullmatch(name)
         inode = _inode_if_free(folder / name) if match else None
-        if match and inode is not None and not is_alive(match["run"]):
-            found[name] = inode
+        if match and inode is not None:
+            mark = folder / f"neuros_{match['run']}{MARK}"
+            if read_if_held(mark) is None:
+                found[name] = inode
     return found
+
+
+def read_if_held(path: Path) -> bytes | None:
+    """The beginning of a file that a process has locked; ``None``: it has no lock, or is none."""
+    with contextlib.suppress(FileNotFoundError), _opened(path) as descriptor:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return os.read(descriptor, 1 << 20)
+    return None
 
 
 def _inode_if_free(path: Path) -> int | None:
     """The inode of a file or folder of this user without a lock."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            status = os.fstat(descriptor)
-            return status.st_ino if status.st_uid == os.getuid() else None
-        finally:
-            os.close(descriptor)
+    with contextlib.suppress(OSError), _opened(path) as descriptor:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        status = os.fstat(descriptor)
+        return status.st_ino if status.st_uid == os.getuid() else None
     return None
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)

@@ -94,11 +94,6 @@ class RecorderProcess:
         self._environment = environment
         self._process = self._start()
 
-    @property
-    def pid(self) -> int:
-        """Its process id; it leads a session of its own."""
-        return self._process.pid
-
     def finish(self, is_given_up: Callable[[], bool]) -> Recorded:
         """Wait until the last packets are in the bag.
 

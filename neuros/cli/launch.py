@@ -11,12 +11,13 @@ import signal
 import socket
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.api.request import LaunchOptions
+from neuros.backends.guardian import start_guardian
 from neuros.cli import EXIT_CODES
 from neuros.cli.common import add_project, load_with_messages
 from neuros.errors import EnvironmentFault, NeurosError
@@ -82,17 +83,24 @@ def _back_end_of(parsed: argparse.Namespace) -> str:
 
 def _launch(parsed: argparse.Namespace) -> int:
     """Run a project; returns the exit code."""
-    with signals_noted() as (signals, waker):
+    with signals_noted() as (signals, waker), ExitStack() as stack:
+        options = parsed_as(LaunchOptions, parsed)
+        name, guardian = _back_end_of(parsed), None
+        if name != AUTO:
+            back_end = BACK_ENDS.load(name)
+            values = values_of(back_end.options, parsed)
+            given = {key: value for key, value in values.items() if value is not None}
+            options = replace(options, backend_options=given)
+        project, messages = load_with_messages(parsed)
+        # It imports while this process does; but nodes share its network.
+        if name != AUTO and back_end.is_forked and not (options.dry_run or options.isolate):
+            guardian = start_guardian(back_end)
+            stack.callback(guardian.finish)
+
         from neuros.api.execution import Execution
         from neuros.api.plan import make_plan
         from neuros.cli.environments import make_shown_environments, signals_interrupt
 
-        options = parsed_as(LaunchOptions, parsed)
-        name = _back_end_of(parsed)
-        values = {} if name == AUTO else values_of(BACK_ENDS.load(name).options, parsed)
-        given = {key: value for key, value in values.items() if value is not None}
-        options = replace(options, backend_options=given)
-        project, messages = load_with_messages(parsed)
         # Preparing other machines may take minutes.
         heeding = nullcontext() if options.deployment is None else signals_interrupt(signals)
         try:
@@ -114,7 +122,7 @@ def _launch(parsed: argparse.Namespace) -> int:
         if options.isolate and not plan.back_end.has_own_network:
             _enter_own_network()
         views = [view for view in prepared if view is not None]
-        run = Execution(plan, sys.stdout, signals, waker, views=views)
+        run = Execution(plan, sys.stdout, signals, waker, views=views, guardian=guardian)
         exit_code = int(run.run()["exit_code"])
         if run.output_failure is not None and not exit_code:
             raise EnvironmentFault(

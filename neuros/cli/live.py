@@ -158,7 +158,7 @@ def _stop(options: argparse.Namespace) -> int:
         session.interrupt()
     next_remark_s = time.monotonic() + _REMARK_S
     waiting = {session.run for session in chosen}
-    # A run has ended when its reaper has gone.
+    # A run has ended when its guardian has gone.
     while waiting := waiting & {session.run for session in sessions()}:
         if time.monotonic() >= next_remark_s:
             next_remark_s += _REMARK_S
@@ -168,7 +168,7 @@ def _stop(options: argparse.Namespace) -> int:
     for session in chosen:
         print(f"stopped {session.run[:_SHOWN]} ({session.project}); run folder {session.folder}")
     for name in remove_dead_runs():
-        print(f"removed {name} from shared memory: its run was killed, and its reaper, too")
+        print(f"removed {name} from shared memory: its run was killed, and its guardian, too")
     return 0
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from neuros.backends.control_sockets import connect_by
 from neuros.node.process import NodeProcess
-from neuros.ports import Middleware, PacketRecorder
+from neuros.ports import Middleware, PacketRecorder, TransportKind
 from neuros.project.model import NodeFile
 from neuros.project.split import node_files_from_json
 from neuros.recording.provenance import note_versions
@@ -38,6 +38,12 @@ def add_node(node: argparse.ArgumentParser) -> None:
     node.set_defaults(command=_run_node)
 
 
+def load_transport(name: str) -> TransportKind:
+    """Import a transport, and what nodes need of ROS."""
+    with imports_when_used():
+        return TRANSPORTS.load(name)
+
+
 def _run_node(options: argparse.Namespace) -> int:
     """Run the nodes of the given ``node.json`` files until they are asked to end."""
     # At exit Python closes the files that a plugin left open, but not among frozen objects.
@@ -52,9 +58,7 @@ def _run_node(options: argparse.Namespace) -> int:
     def make_middleware(
         files: Sequence[NodeFile], on_failure: Callable[[BaseException], None]
     ) -> Middleware:
-        with imports_when_used():
-            transport = TRANSPORTS.load(options.transport)
-        middleware = transport.middleware(
+        middleware = load_transport(options.transport).middleware(
             files,
             on_failure,
             digests=options.digests,

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from neuros.transport.ros_topics import RosTopic
 
 _POLL_S = 0.1
-# The launcher was killed: its reaper kills what is left of the run after 4.5 s.
+# The launcher was killed: its guardian kills what is left of the run after 4.5 s.
 _ORPHANED_S = 4.0
 
 

@@ -176,7 +176,7 @@ class Supervisor:
         self._paused_before_s = 0.0  # time 0 of the run
         self._deadline_s = 0.0  # of draining, or of processes that were killed
         self._kill_early_s = math.inf
-        self._is_hopeless = False  # something outlasts even SIGKILL; the reaper tries on
+        self._is_hopeless = False  # something outlasts even SIGKILL; the guardian tries on
         self._told_s: dict[str, float] = {}
         self._refused: set[ControlLink] = set()
         self._refused_count = 0
@@ -626,7 +626,7 @@ class Supervisor:
         return [f"'{name}' did not begin to finalise{silence}"]
 
     def _wait_for_killed(self) -> None:
-        """All are killed; what outlasts that is left to the reaper after a while."""
+        """All are killed; what outlasts that is left to the guardian after a while."""
         self.phase = Phase.KILLED
         self._deadline_s = time.monotonic() + _KILLED_S
 

@@ -66,9 +66,9 @@ STANDARD_CONTAINERS = frozenset(
 PROJECT_FILE = "project.json"
 _T = TypeVar("_T")
 _OWN_VARIABLES = frozenset(
-    f"NEUROS_{name}" for name in ("RUN_ID", "RUN_DIR", "CONTROL", "ELSEWHERE", "GUARDED_RUN")
+    f"NEUROS_{name}" for name in ("RUN_ID", "RUN_DIR", "CONTROL", "ELSEWHERE")
 )
-"""Variables by which the processes of a run, and the reaper, find each other."""
+"""Variables by which the processes of a run, and the guardian, find each other."""
 
 
 class _Builder:

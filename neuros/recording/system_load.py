@@ -25,7 +25,7 @@ from neuros.ordinary_files import open_new
 FILE_NAME = "system_load.csv"
 
 LAUNCHER = "launcher"
-"""The group of the launcher, its reaper, and other programs that it starts."""
+"""The group of the launcher, its guardian, and other programs that it starts."""
 
 PERIOD_S = 1.0
 
@@ -233,7 +233,7 @@ class LoadMeter:
             load = _load_of(process, with_children=group != LAUNCHER)
             if load is not None:
                 found.setdefault(group, []).append(load)
-        # The reaper collects the nodes' processes: their time must not appear as the launcher's.
+        # The guardian collects the nodes' processes: their time must not appear as the launcher's.
         own = _load_of(self._launcher, with_children=False)
         if own is not None:
             found.setdefault(LAUNCHER, []).append(own)

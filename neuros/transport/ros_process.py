@@ -159,7 +159,7 @@ class RosProcess:
         """Close the loop and ROS. In a crowd, ROS may stay open until the process ends.
 
         Other processes of a crowd then notice after 20 s that this one has gone, as if it had been
-        killed; the shared memory of DDS is left to the reaper.
+        killed; the shared memory of DDS is left to the guardian.
         """
         self._close_callbacks()
         self.ros_loop.close()

@@ -218,7 +218,7 @@ def test_ctrl_c_between_start_and_wait_leaves_nothing_running(
     assert not [each for each in open_files() if "neuros-domain-" in each]
 
 
-def test_a_run_that_cannot_be_observed_leaves_no_reaper(
+def test_a_run_that_cannot_be_observed_leaves_no_guardian(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = project(tmp_path)
@@ -282,7 +282,7 @@ def test_a_run_that_cannot_start_says_so(tmp_path: Path, monkeypatch: pytest.Mon
     def fail(*_: object) -> None:
         raise OSError("too many of them")
 
-    monkeypatch.setattr("neuros.backends.reaper.Reaper.spawn", fail)
+    monkeypatch.setattr("neuros.backends.guardian.Guardian.spawn", fail)
     with pytest.raises(EnvironmentFault, match="cannot start the process of thrower"):
         made.run(backend="in-process", output="run")
     assert neuros.Run("run").exit_code == 4

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from neuros.backends.guardian import Guardian
 from neuros.backends.node_command import (
     THREAD_VARIABLES,
     NodeProcess,
@@ -20,7 +21,6 @@ from neuros.backends.node_command import (
     usable_cores,
 )
 from neuros.backends.process_launchers import RunningProcess
-from neuros.backends.reaper import Reaper
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
 
@@ -47,33 +47,35 @@ def test_thread_pools_have_as_many_threads_as_the_node_asks_for_cores() -> None:
 
 # ------------------------------------------------------------------ processes
 @pytest.fixture
-def reaper() -> Iterator[Reaper]:
-    reaper = Reaper.start(secrets.token_hex(8))
-    yield reaper
-    reaper.finish()
+def guardian() -> Iterator[Guardian]:
+    guardian = Guardian.start(secrets.token_hex(8))
+    yield guardian
+    guardian.finish()
 
 
-def _mask_of(tmp_path: Path, cores: tuple[int, ...], reaper: Reaper) -> set[int]:
+def _mask_of(tmp_path: Path, cores: tuple[int, ...], guardian: Guardian) -> set[int]:
     program = "import json, os; print(json.dumps(sorted(os.sched_getaffinity(0))))"
     log = tmp_path / "log"
     log.unlink(missing_ok=True)
     command = ["python3", "-S", "-c", program]
     process = NodeProcess(("a",), command, command, os.environ, log, tmp_path, cores)
-    host = RunningProcess(process, reaper)
+    host = RunningProcess(process, guardian)
     assert host.wait(10) == "exit code 0"
     return set(json.loads(log.read_text()))
 
 
-def test_a_process_has_its_cores_and_the_next_one_all(tmp_path: Path, reaper: Reaper) -> None:
+def test_a_process_has_its_cores_and_the_next_one_all(tmp_path: Path, guardian: Guardian) -> None:
     before = usable_cores()
     for core in before:
-        assert _mask_of(tmp_path, (core,), reaper) == {core}
-    assert _mask_of(tmp_path, (), reaper) == before
+        assert _mask_of(tmp_path, (core,), guardian) == {core}
+    assert _mask_of(tmp_path, (), guardian) == before
     assert usable_cores() == before
 
 
-def test_a_core_that_is_not_there_is_a_fault_of_the_machine(tmp_path: Path, reaper: Reaper) -> None:
+def test_a_core_that_is_not_there_is_a_fault_of_the_machine(
+    tmp_path: Path, guardian: Guardian
+) -> None:
     before = usable_cores()
     with pytest.raises(EnvironmentFault, match="cannot start the process of a: "):
-        _mask_of(tmp_path, (max(before) + 1000,), reaper)
-    assert _mask_of(tmp_path, (), reaper) == before
+        _mask_of(tmp_path, (max(before) + 1000,), guardian)
+    assert _mask_of(tmp_path, (), guardian) == before

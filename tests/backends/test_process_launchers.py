@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from neuros.backends import node_command
+from neuros.backends.guardian import Guardian
 from neuros.backends.node_command import process_environment
 from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher, RunningProcess
-from neuros.backends.reaper import Reaper
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.model import Folders, Node, NodeFile
@@ -38,7 +38,7 @@ class Run:
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "a run"
         self.folder.mkdir()
-        self.reaper = Reaper.start(secrets.token_hex(8))
+        self.guardian = Guardian.start(secrets.token_hex(8))
         self.hosts: list[RunningProcess] = []
 
     def node(self, name: str, script: Path | None = None, **environment: str) -> NodeFile:
@@ -56,7 +56,7 @@ class Run:
         self, program: str, nodes: Sequence[NodeFile], in_process: bool = False
     ) -> list[RunningProcess]:
         kind = InProcessLauncher if in_process else ProcessLauncher
-        launcher = kind(NodeProgram(program=command(program), reaper=self.reaper))
+        launcher = kind(NodeProgram(program=command(program), guardian=self.guardian))
         self.hosts += launcher.start(nodes, {"NEUROS_RUN_ID": "1234", "SHARED": "run"})
         return self.hosts
 
@@ -72,7 +72,7 @@ class Run:
 def run(tmp_path: Path) -> Iterator[Run]:
     run = Run(tmp_path)
     yield run
-    run.reaper.finish()
+    run.guardian.finish()
 
 
 def _wait_until(condition: Callable[[], bool], deadline_s: float = 10.0) -> None:
@@ -209,11 +209,11 @@ def test_a_program_that_does_not_exist_is_a_fault_and_the_others_do_not_stay(run
     program = NodeProgram(
         program=command(SLEEP),
         pythons={"a": here, "b": nowhere},
-        reaper=run.reaper,
+        guardian=run.guardian,
     )
     with pytest.raises(EnvironmentFault, match=r"process of b: .*No such file.*/nowhere/python"):
         ProcessLauncher(program).start([run.node("a"), run.node("b")], {})
-    assert not any(_is_alive(pid) for pid in _children_of(run.reaper.pid))
+    assert not any(_is_alive(pid) for pid in _children_of(run.guardian.pid))
 
 
 def test_what_no_process_can_be_given_is_a_fault_and_the_next_one_starts(run: Run) -> None:
@@ -222,14 +222,14 @@ def test_what_no_process_can_be_given_is_a_fault_and_the_next_one_starts(run: Ru
     assert run.end("pass", [run.node("robot")]) == ["exit code 0"]
 
 
-def test_how_a_process_ended_is_not_known_when_its_reaper_was_killed(run: Run) -> None:
+def test_how_a_process_ended_is_not_known_when_its_guardian_was_killed(run: Run) -> None:
     (host,) = run.start(SLEEP, [run.node("snn")])
-    os.kill(run.reaper.pid, signal.SIGKILL)
-    _wait_until(lambda: not run.reaper.is_on_duty)
+    os.kill(run.guardian.pid, signal.SIGKILL)
+    _wait_until(lambda: not run.guardian.is_on_duty)
     assert host.poll() is None
     host.kill()
-    assert host.wait(10) == "how is not known, since the reaper was killed"
-    with pytest.raises(EnvironmentFault, match="process of robot: the reaper was killed"):
+    assert host.wait(10) == "how is not known, since the guardian was killed"
+    with pytest.raises(EnvironmentFault, match="process of robot: the guardian was killed"):
         run.start(SLEEP, [run.node("robot")])
 
 

@@ -1,7 +1,8 @@
-"""`neuros ps` and `neuros stop`: runs are seen by their reapers."""
+"""`neuros ps` and `neuros stop`: runs are seen by their marks."""
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import secrets
@@ -10,15 +11,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from contextlib import contextmanager
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from endings import KEEP_THE_GIL, RUNS
 from launching import Running, start
 
-from neuros.backends.reaper import Reaper
-from neuros.backends.sessions import RunOnThisMachine, reaper_environment, sessions, this_process
+from neuros.backends.sessions import RunOnThisMachine, mark, sessions, this_process
 
 PLUGIN = f"from neuros.hooks import neuros_tick\n{RUNS}"
 PROJECT = """
@@ -30,57 +32,69 @@ PROJECT = """
 
 @pytest.fixture
 def session() -> Iterator[RunOnThisMachine]:
-    """A run of this process, that has a reaper and nothing else."""
+    """A run of this process, that has a mark and nothing else."""
     session = RunOnThisMachine(
         *(secrets.token_hex(8), "demo", "process", ("a",), "/runs/1", time.time(), this_process())
     )
-    reaper = Reaper.start(session.run, None, reaper_environment(session))
+    lock = mark(session)
     yield session
-    reaper.finish()
+    lock.release()
     assert session not in sessions()
 
 
+@contextmanager
+def marked(text: str, run: str = "") -> Iterator[Path]:
+    """Any text in the place of the mark of a run, and a process that has it locked."""
+    path = Path(f"/dev/shm/neuros_{run or secrets.token_hex(8)}_mark")
+    path.write_text(text)
+    with open(path) as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        yield path
+    path.unlink()
+
+
+def described(session: RunOnThisMachine, **others: object) -> dict[str, Any]:
+    """What the mark of another such run says."""
+    return {**asdict(session), "run": secrets.token_hex(8), **others}
+
+
 def test_runs_of_other_versions_are_seen_if_they_say_enough(session: RunOnThisMachine) -> None:
-    ((variable, text),) = reaper_environment(session).items()
-    said = json.loads(text)
-    newer = {**said, "run": secrets.token_hex(8), "colour": "red"}
+    newer = described(session, colour="red")
     older = {"run": secrets.token_hex(8), "project": "demo"}
-    reapers = [
-        Reaper.start(each["run"], None, {variable: json.dumps(each)}) for each in (newer, older)
-    ]
-    runs = {each.run for each in sessions()}
-    for reaper in reapers:
-        reaper.finish()
+    with marked(json.dumps(newer)), marked(json.dumps(older)):
+        runs = {each.run for each in sessions()}
     assert newer["run"] in runs
     assert older["run"] not in runs
 
 
 @pytest.mark.parametrize(
-    "written", ["{", "[]", "1", '{"run": 1}', "[" * 100_000, '{"nodes": {"a": 1}, "since": "now"}']
+    "written",
+    ["", "{", "[]", "1", '{"run": 1}', "[" * 100_000, '{"nodes": {"a": 1}, "since": "now"}'],
 )
 def test_what_describes_no_run_is_passed_over(written: str, session: RunOnThisMachine) -> None:
-    (variable,) = reaper_environment(session)
-    reaper = Reaper.start(secrets.token_hex(8), None, {variable: written})
-    found = sessions()
-    reaper.finish()
-    assert session in found
+    with marked(written):
+        assert session in sessions()
+
+
+def test_a_mark_that_nobody_has_locked_is_no_run(session: RunOnThisMachine) -> None:
+    left = described(session)
+    with marked(json.dumps(left)) as path:
+        path.unlink()
+        path.write_text(json.dumps(left))
+        assert left["run"] not in {each.run for each in sessions()}
 
 
 def test_names_do_nothing_to_a_terminal(session: RunOnThisMachine) -> None:
-    ((variable, text),) = reaper_environment(session).items()
-    forged = {**json.loads(text), "run": secrets.token_hex(8), "project": "\x1b[2Jdemo\x07"}
-    reaper = Reaper.start(forged["run"], None, {variable: json.dumps(forged)})
-    names = {each.run: each.project for each in sessions()}
-    reaper.finish()
+    forged = described(session, project="\x1b[2Jdemo\x07")
+    with marked(json.dumps(forged)):
+        names = {each.run: each.project for each in sessions()}
     assert names[forged["run"]] == "demo\\x07"
 
 
-def test_a_run_is_its_reapers_users_whatever_that_says(session: RunOnThisMachine) -> None:
-    ((variable, text),) = reaper_environment(session).items()
-    forged = {**json.loads(text), "run": secrets.token_hex(8), "user": os.getuid() + 1}
-    reaper = Reaper.start(forged["run"], None, {variable: json.dumps(forged)})
-    users = {each.run: each.user for each in sessions()}
-    reaper.finish()
+def test_a_run_is_its_marks_owners_whatever_that_says(session: RunOnThisMachine) -> None:
+    forged = described(session, user=os.getuid() + 1)
+    with marked(json.dumps(forged)):
+        users = {each.run: each.user for each in sessions()}
     assert users[forged["run"]] == os.getuid()
 
 
@@ -110,7 +124,7 @@ def run_of(running: Running) -> RunOnThisMachine:
     return next(each for each in sessions() if each.launcher[0] == running.process.pid)
 
 
-def test_a_run_is_there_as_long_as_its_reaper(session: RunOnThisMachine) -> None:
+def test_a_run_is_there_as_long_as_its_mark_is_locked(session: RunOnThisMachine) -> None:
     assert session in sessions()
     assert session.is_led
     assert session.states() == {"a": "not running"}

@@ -19,7 +19,7 @@ from pathlib import Path
 import pytest
 
 from neuros.backends.domain import DomainLock, choose_domain
-from neuros.backends.reaper import Reaper
+from neuros.backends.guardian import Guardian
 from neuros.backends.run_processes import RUN_ID
 from neuros.backends.shared_memory import hold, remove_dead_runs, sweep
 from neuros.transport.dds_profile import PROFILES_VARIABLE, RANGE_VARIABLE
@@ -131,14 +131,15 @@ def test_a_folder_that_does_not_exist_is_clean(tmp_path: Path) -> None:
     assert remove(tmp_path / "nowhere") == ()
 
 
-def test_the_reaper_removes_the_segments_of_its_run() -> None:
+def test_the_guardian_removes_the_segments_of_its_run() -> None:
     run_id = secrets.token_hex(8)
-    reaper = Reaper.start(run_id)
+    guardian = Guardian.start(run_id)
+    guardian.await_ready()
     segment = SHM / f"neuros_{run_id}_camera_image_1"
     try:
         segment.write_bytes(b"x" * 64)
     finally:
-        reaper.finish()
+        guardian.finish()
     assert not segment.exists()
 
 
@@ -233,7 +234,8 @@ def test_a_killed_run_leaves_nothing_and_its_neighbours_go_on(
     domain: DomainLock, nodes: list[RosNode]
 ) -> None:
     run_id = secrets.token_hex(8)
-    reaper = Reaper.start(run_id)
+    guardian = Guardian.start(run_id)
+    guardian.await_ready()
     try:
         # The run is there first, so that its neighbours know, and map, its memory.
         nodes.append(RosNode("talker_of_the_run", domain.id, run_id))
@@ -248,7 +250,7 @@ def test_a_killed_run_leaves_nothing_and_its_neighbours_go_on(
         owned = {name for pid in others for name in _in_use(pid) if name.endswith("_el")}
         os.kill(run, signal.SIGKILL)
     finally:
-        reaper.finish()
+        guardian.finish()
     left = _names(SHM)
     dead = {name for name in of_the_run if f"{name}_el" not in owned}
     assert dead
@@ -266,7 +268,8 @@ def test_a_run_that_is_alone_leaves_shared_memory_as_it_was(
     domain: DomainLock, nodes: list[RosNode]
 ) -> None:
     run_id = secrets.token_hex(8)
-    reaper = Reaper.start(run_id)
+    guardian = Guardian.start(run_id)
+    guardian.await_ready()
     try:
         nodes.append(RosNode("listener", domain.id, run_id))
         nodes.append(RosNode("talker", domain.id, run_id))
@@ -274,7 +277,7 @@ def test_a_run_that_is_alone_leaves_shared_memory_as_it_was(
         used = set().union(*(_in_use(node.process.pid) for node in nodes))
         assert any(name.startswith("fastrtps_port") for name in used)
     finally:
-        reaper.finish()
+        guardian.finish()
     stays = {name for name in used if name.startswith("lttng")}  # others may be using these
     bases = {name.removesuffix("_el") for name in used - stays}
     assert not {name for name in _names(SHM) for base in bases if base in name}
@@ -321,16 +324,14 @@ def test_large_packets_stay_while_their_sender_has_mapped_them(tmp_path: Path, r
     writer.close()
 
 
-def test_nothing_goes_while_a_process_of_the_run_is_there(tmp_path: Path, run: str) -> None:
-    (tmp_path / f"neuros_{run}").mkdir()
-    with subprocess.Popen(
-        [sys.executable, "-c", "input()"],
-        stdin=subprocess.PIPE,
-        env={**os.environ, RUN_ID: run},
-    ) as node:
+def test_nothing_goes_while_the_mark_of_the_run_is_locked(tmp_path: Path, run: str) -> None:
+    """A sender that has ended holds nothing any more; receivers may still need its packets."""
+    packets, mark = tmp_path / f"neuros_{run}_camera_image_1", tmp_path / f"neuros_{run}_mark"
+    packets.touch()
+    with open(mark, "w") as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
         assert remove(tmp_path) == ()
-        node.communicate(b"\n")
-    assert remove(tmp_path) == (f"neuros_{run}",)
+    assert remove(tmp_path) == (packets.name, mark.name)
 
 
 def test_what_is_called_differently_is_left_alone(tmp_path: Path, run: str) -> None:

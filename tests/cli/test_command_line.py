@@ -460,7 +460,7 @@ def test_what_could_not_be_started_is_recorded_and_leaves_nothing(
     assert main(["launch", ".", "-o", "out"]) == 4
     output = capsys.readouterr()
     assert "Traceback" not in output.err
-    assert output.err.startswith("neuros: the reaper process cannot be started: ")
+    assert output.err.startswith("neuros: the guardian process cannot be started: ")
     assert not Path("out/control.sock").exists()
 
 

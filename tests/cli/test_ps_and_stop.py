@@ -22,8 +22,8 @@ def test_what_killed_runs_have_left_is_removed_and_said(
     assert main(["stop"]) == 0
     assert capsys.readouterr().out.splitlines() == [
         "nothing is running",
-        "removed neuros_12 from shared memory: its run was killed, and its reaper, too",
-        "removed neuros_34_image from shared memory: its run was killed, and its reaper, too",
+        "removed neuros_12 from shared memory: its run was killed, and its guardian, too",
+        "removed neuros_34_image from shared memory: its run was killed, and its guardian, too",
     ]
 
 

@@ -24,7 +24,7 @@ SIGNALS = {
     "SIGSEGV": signal.SIGSEGV,
     "stopped for 2 s": signal.SIGSTOP,
 }
-TARGETS = ("launcher", "reaper", "recorder", "dashboard", "engine")
+TARGETS = ("launcher", "guardian", "recorder", "dashboard", "engine")
 MOMENTS = {"starting": "import", "running": "function", "ending": "finalise"}
 """Where the run stands, and the place of a plugin that it stands at then."""
 
@@ -69,7 +69,7 @@ class ProcessFault:
 
     @property
     def expected(self) -> Expected:
-        """The run goes on without sidecars and reaper, and ends with its launcher or engine."""
+        """The run goes on without sidecars and guardian, and ends with its launcher or engine."""
         if self.signal == "stopped for 2 s":
             return Expected(within_s=_DURATION_S + _STOPPED_S + 6.0)
         if self.target == "launcher" and self.is_fatal:
@@ -88,8 +88,8 @@ class ProcessFault:
             says = "" if self.signal == "SIGTERM" else "the Docker engine "
             is_up = self.moment != "starting"
             return Expected(codes, last_says=says, has_record=is_up, has_bag=is_up)
-        is_told = self.target == "reaper" and self.is_fatal
-        says = "the reaper was killed: the launcher does its work" if is_told else ""
+        is_told = self.target == "guardian" and self.is_fatal
+        says = "the guardian was killed: the launcher does its work" if is_told else ""
         return Expected(says=says, within_s=_DURATION_S + 6.0)
 
 
@@ -169,8 +169,8 @@ def _pid_of(target: str, trial: Trial) -> int:
 
 
 def _is_target(process: psutil.Process, target: str) -> bool:
-    if target == "reaper":
-        return "NEUROS_GUARDED_RUN" in process.environ()
+    if target == "guardian":
+        return "guardian_program" in " ".join(process.cmdline())
     return process.cmdline()[4:5] == [target]
 
 

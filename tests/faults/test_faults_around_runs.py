@@ -27,7 +27,7 @@ from .trials import Outcome
 _FAULTS = (
     ProcessFault("stopped for 2 s", "launcher", "running", "process"),
     ProcessFault("SIGTERM", "launcher", "ending", "in-process"),
-    ProcessFault("SIGSEGV", "reaper", "running", "process"),
+    ProcessFault("SIGSEGV", "guardian", "running", "process"),
     ProcessFault("kill -9", "recorder", "ending", "in-process"),
     ProcessFault("SIGTERM", "dashboard", "running", "in-process"),
 )

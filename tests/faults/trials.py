@@ -205,7 +205,7 @@ class Trial:
         """
         is_over = read_to_end(running, time.monotonic() + GIVES_UP_AFTER_S)
         took_s = time.monotonic() - due_s
-        # Where the launcher was killed, its reaper cleans up after it.
+        # Where the launcher was killed, its guardian cleans up after it.
         until_s = time.monotonic() if expected.has_record else due_s + GIVES_UP_AFTER_S
         left = self._left(until_s, is_left)
         if not expected.has_record:

@@ -108,7 +108,7 @@ def test_a_daemon_ends_with_the_run(tmp_path: Path, marks: Path, backend: str, e
         if number is not None:
             running.signal(number)
         running.finish()
-        # The reaper of a launcher that was killed gives nodes 4.5 s, and kills what is left.
+        # The guardian of a launcher that was killed gives nodes 4.5 s, and kills what is left.
         _wait_until(lambda: not _daemons(marks), 6.0 if number == signal.SIGKILL else 0.0)
 
 

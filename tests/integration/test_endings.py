@@ -1,6 +1,6 @@
 """However nodes fail: the exit code, the last line, complete logs, and nothing left behind.
 
-Real launchers, reapers and nodes on real rclpy, on both back ends; so in `test_endings_drained`
+Real launchers, guardians and nodes on real rclpy, on both back ends; so in `test_endings_drained`
 and `test_endings_interrupted`.
 """
 

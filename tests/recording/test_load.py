@@ -126,16 +126,18 @@ def test_the_time_of_a_child_that_has_ended_stays_with_its_node(start: Start) ->
     assert meter.groups()["snn"].cpu_s >= 0.39
 
 
-def test_a_node_that_has_ended_is_not_counted_to_the_reaper_that_collects_it(start: Start) -> None:
+def test_a_node_that_has_ended_is_not_counted_to_the_guardian_that_collects_it(
+    start: Start,
+) -> None:
     spin = "import time\nwhile time.process_time() < 0.4: pass"
-    reaper = (
+    guardian = (
         "import subprocess, sys\n"
         f"subprocess.run([sys.executable, '-I', '-S', '-c', {spin!r}], env={{'{MARK}': 'snn'}})\n"
         "print('done', flush=True); input()"
     )
     meter = LoadMeter(owner)
     before_s = meter.groups()[LAUNCHER].cpu_s
-    process = start(reaper, None)
+    process = start(guardian, None)
     assert process.stdout.readline() == b"done\n"
     load = load_of(meter, LAUNCHER, lambda load: load.threads > threading.active_count())
     assert load.cpu_s - before_s < 0.3

@@ -113,7 +113,7 @@ class Running:
         return Finished(exit_code, self.output, folder, _record(folder))
 
     def close(self) -> None:
-        """End the run if it goes on: politely, then by force (its reaper ends the nodes)."""
+        """End the run if it goes on: politely, then by force (its guardian ends the nodes)."""
         assert self.process.stdout is not None
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)

@@ -28,6 +28,7 @@ def write():
 atexit.register(write)
 leave = os._exit
 os._exit = lambda code: (write(), leave(code))
+os.register_at_fork(after_in_child=calls.clear)  # the guardian has made them
 threading.setprofile(note)
 sys.setprofile(note)
 """

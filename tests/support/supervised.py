@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from neuros.backends.control_sockets import SOCKET_NAME, UnixListener
+from neuros.backends.guardian import Guardian
 from neuros.backends.process_launchers import InProcessLauncher, ProcessLauncher, RunningProcess
-from neuros.backends.reaper import Reaper
 from neuros.launcher.outcome import Outcome
 from neuros.launcher.peers import Peers
 from neuros.launcher.supervisor import Supervisor
@@ -81,11 +81,11 @@ class Run:
         files = [self.file(name, act, connections) for name, act in acts.items()]
         kind = InProcessLauncher if in_process else ProcessLauncher
         with contextlib.ExitStack() as stack:
-            reaper = Reaper.start(secrets.token_hex(8))
-            stack.callback(reaper.finish)
+            guardian = Guardian.start(secrets.token_hex(8))
+            stack.callback(guardian.finish)
             supervisor = Supervisor(
                 files,
-                _Noting(kind(NodeProgram(program=HOST, reaper=reaper)), self.hosts),
+                _Noting(kind(NodeProgram(program=HOST, guardian=guardian)), self.hosts),
                 {"ALL": " ".join(acts)} | ({"ACT": acts["all"]} if in_process else {}),
                 self.folder,
                 self.output,

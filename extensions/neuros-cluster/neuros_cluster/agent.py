@@ -1,8 +1,8 @@
 """Program of an agent: runs nodes of a project for a launcher on another machine.
 
 The launcher starts it (``ssh pi@robot neuros agent``) and talks to it over its standard input and
-output. When the launcher falls silent, or closes these, all nodes end; a reaper ends them where the
-agent itself is killed.
+output. When the launcher falls silent, or closes these, all nodes end; a guardian ends them where
+the agent itself is killed.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.control_sockets import SOCKET_NAME, UnixListener
-from neuros.backends.domain import DomainLock, choose_domain
+from neuros.backends.domain import DomainLock, FileLock, choose_domain
+from neuros.backends.guardian import Guardian
 from neuros.backends.process_launchers import ProcessLauncher, RunningProcess, end_now
 from neuros.backends.pythons import Pythons
-from neuros.backends.reaper import Reaper
 from neuros.backends.run_processes import RUN_ID
-from neuros.backends.sessions import RunOnThisMachine, reaper_environment, this_process
+from neuros.backends.sessions import RunOnThisMachine, mark, this_process
 from neuros.control import CONTROL_VARIABLE, Message
 from neuros.distribution import __version__
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError
@@ -102,8 +102,9 @@ class Agent:
         self._trees: tuple[Tree, ...] = ()
         self._run: Path | None = None
         self._pythons = Pythons({})
-        self._reaper: Reaper | None = None
+        self._guardian: Guardian | None = None
         self._domain: DomainLock | None = None
+        self._mark: FileLock | None = None
         self._monitor: LoadMonitor | None = None
         self._follower: Follower | None = None
         self._processes: dict[str, RunningProcess] = {}
@@ -134,10 +135,11 @@ class Agent:
             for process in self._processes.values():
                 process.wait(max(0.0, end_s - time.monotonic()))
             end_now(tuple(self._processes.values()))
-            if self._reaper is not None:
-                self._reaper.finish()
-            if self._domain is not None:
-                self._domain.release()
+            if self._guardian is not None:
+                self._guardian.finish()
+            for lock in (self._domain, self._mark):
+                if lock is not None:
+                    lock.release()
             if not (self._is_lost and self._has_started) and self._run is not None:
                 shutil.rmtree(self._run, ignore_errors=True)
         return 1 if self._is_lost else 0
@@ -152,7 +154,7 @@ class Agent:
         """Note that the launcher is gone. Runs in the pump's thread, or a signal handler."""
         self._is_lost = True
         self._inbox.put(None)
-        if not self._has_started:  # pip or a compiler may be running, which the reaper ends
+        if not self._has_started:  # pip or a compiler may be running, which the guardian ends
             if self._run is not None:
                 shutil.rmtree(self._run, ignore_errors=True)
             os._exit(1)
@@ -253,7 +255,7 @@ class Agent:
         known = {path.relative_to(self._run).as_posix() for path in given}
         self._follower = Follower(self._run, names, order.machine, known)
         listener = UnixListener(self._run)
-        # The first digits are those of the launcher's run; to reapers it is another run.
+        # The first digits are those of the launcher's run; to guardians it is another run.
         run_id = order.run[:8] + os.urandom(4).hex()
         self._domain = choose_domain(int(order.environment["ROS_DOMAIN_ID"]), os.environ, False)
         session = RunOnThisMachine(
@@ -268,9 +270,13 @@ class Agent:
             control=listener.address,
         )
         self._has_started = True
-        self._reaper = Reaper.start(run_id, self._domain, reaper_environment(session))
+        self._guardian = Guardian.start(run_id)
+        self._guardian.await_ready()
+        self._mark = mark(session)
+        for lock in (self._domain, self._mark):
+            self._guardian.hold(lock)
         for path in listener.files:
-            self._reaper.remove_later(path)
+            self._guardian.remove_later(path)
         listener.open()
         self._pump.listen(listener)
         own = {
@@ -279,7 +285,7 @@ class Agent:
             "ROS_LOG_DIR": str(self._run),
         }
         program = NodeProgram(
-            order.options, order.cores, self._pythons.paths, self._reaper, as_asked(os.environ)
+            order.options, order.cores, self._pythons.paths, self._guardian, as_asked(os.environ)
         )
         if order.monitors_load:
             from neuros.api.observation import load_monitor

@@ -278,8 +278,8 @@ class _Launcher:
         if side.container:  # the packages are built by now
             side.messages = side.container.put_messages(files[0].messages)
         others = [side.here, *(each.address for each in self._machines.sides if each is not side)]
-        if self._program.reaper:
-            self._program.reaper.watch(side.machine.pid)
+        if self._program.guardian:
+            self._program.guardian.watch(side.machine.pid)
         side.machine.begin(
             Start(
                 environment["NEUROS_RUN_ID"],

@@ -242,7 +242,7 @@ class AtWork:
         return finished
 
     def assert_gone(self, until_s: float) -> None:
-        """No process of the run is left there, its reaper included."""
+        """No process of the run is left there, its guardian included."""
         while time.monotonic() < until_s + SLACK_S:
             alive = RunProcesses(self.there.run).alive()
             if not alive and self.there.run not in {each.run for each in sessions()}:

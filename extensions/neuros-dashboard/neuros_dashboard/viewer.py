@@ -7,14 +7,14 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
 from neuros.errors import EnvironmentFault
-from neuros.ports import BackEnd, Reaper, Shown
+from neuros.ports import BackEnd, Guardian, Shown
 from neuros.registry import Registry
 
 
 class PreparedViewer(Protocol):
     """A viewer prepared for one run."""
 
-    def start(self, run: Shown, reaper: Reaper) -> str:
+    def start(self, run: Shown, guardian: Guardian) -> str:
         """Open the viewer, once there is a control socket; returns a message for the user.
 
         Raises ``EnvironmentFault``.
@@ -90,12 +90,12 @@ class Views:
                 except EnvironmentFault as fault:
                     raise EnvironmentFault(f"viewer {name}: {fault}") from fault
 
-    def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None:
+    def start(self, run: Shown, guardian: Guardian, log: Callable[[str, str], None]) -> None:
         """Open windows and pages, once there is a control socket. Raises ``EnvironmentFault``."""
         for notice in self._notices:
             log("INFO", notice)
         for view in self._views.values():
-            log("INFO", view.start(run, reaper))
+            log("INFO", view.start(run, guardian))
 
     def finish(self) -> None:
         """Close what was opened."""

@@ -16,7 +16,7 @@ from urllib.parse import quote, urlsplit
 from neuros.backends.sidecars import start_sidecar
 from neuros.distribution import install_command, python_command
 from neuros.errors import EnvironmentFault, UsageError
-from neuros.ports import BackEnd, Reaper, Shown
+from neuros.ports import BackEnd, Guardian, Shown
 from neuros.project.dashboard import ARRAYS, IMAGES, SPIKES
 from neuros.project.graph import guarantee
 from neuros.project.model import Node, Port, Project
@@ -64,13 +64,12 @@ class _DashboardView:
         # The token in it admits the reader.
         self._url = f"http://{HOST}:{self._listening.getsockname()[1]}/?token={self._token}"
 
-    def start(self, run: Shown, reaper: Reaper) -> str:
+    def start(self, run: Shown, guardian: Guardian) -> str:
         command = python_command(PROGRAMS, "dashboard", str(run.folder))
         descriptor, log = self._listening.fileno(), run.folder / "dashboard.log"
         self._process = process = start_sidecar(
             "dashboard", command, log, run.environment, [descriptor]
         )
-        reaper.watch(process.pid)
         self._listening.close()
         _send_settings(
             process,
@@ -113,7 +112,7 @@ class _RerunView:
         self._url = f"http://{HOST}:{self._web_port}/?url={quote(self._feed_url, safe=':/')}"
         self._processes: list[subprocess.Popen[bytes]] = []
 
-    def start(self, run: Shown, reaper: Reaper) -> str:
+    def start(self, run: Shown, guardian: Guardian) -> str:
         server = python_command("rerun", "--serve-web", "--bind", HOST)
         server += ["--port", str(self._feed_port), "--web-viewer-port", str(self._web_port)]
         server += ["--server-memory-limit", _RERUN_MEMORY, "--hide-welcome-screen"]
@@ -123,16 +122,15 @@ class _RerunView:
         for what, command in (("server of Rerun", server), ("feeder of Rerun", feeder)):
             process = start_sidecar(what, command, log, run.environment)
             self._processes.append(process)
-            reaper.watch(process.pid)
-        _send_settings(
-            process,
-            {
-                "project": run.project.name,
-                "sources": project_view(run.project, run.names)["sources"],
-                "feed_url": self._feed_url,
-                "url": self._url,
-            },
-        )
+            _send_settings(
+                process,
+                {
+                    "project": run.project.name,
+                    "sources": project_view(run.project, run.names)["sources"],
+                    "feed_url": self._feed_url,
+                    "url": self._url,
+                },
+            )
         return f"visualisations: {self._url}"
 
     def finish(self) -> None:

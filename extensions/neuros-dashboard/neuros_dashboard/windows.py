@@ -23,7 +23,7 @@ from neuros.backends.sidecars import start_sidecar
 from neuros.distribution import build_command
 from neuros.errors import EnvironmentFault
 from neuros.ordinary_files import write_whole
-from neuros.ports import BackEnd, Reaper, Shown
+from neuros.ports import BackEnd, Guardian, Shown
 from neuros.project.model import Port, Project
 from neuros_dashboard.viewer import Viewer
 
@@ -74,10 +74,6 @@ class ToolProcess:
         log = run.folder / f"{program}.log"
         self._process = start_sidecar(program, command, log, run.environment, is_ours=False)
 
-    def announce(self, reaper: Reaper) -> None:
-        """Have the process ended if the launcher is killed."""
-        reaper.watch(self._process.pid)
-
     def finish(self) -> None:
         """End the process."""
         self._process.terminate()
@@ -113,9 +109,9 @@ class ToolContainer:
                 security_opt=["no-new-privileges"],
             )
 
-    def announce(self, reaper: Reaper) -> None:
+    def announce(self, guardian: Guardian) -> None:
         """Have the container removed if the launcher is killed."""
-        reaper.clean_with(leftovers.__name__, engine_socket(self._engine))
+        guardian.clean_with(leftovers.__name__, engine_socket(self._engine))
 
     def finish(self) -> None:
         """End the container."""
@@ -145,13 +141,13 @@ class _Window:
         self._program, self._path, self._arguments = program, path, arguments
         self._running: ToolProcess | ToolContainer | None = None
 
-    def start(self, run: Shown, reaper: Reaper) -> str:
+    def start(self, run: Shown, guardian: Guardian) -> str:
         arguments = self._arguments(run)
         if self._path is None:
             self._running = ToolContainer(self._program, arguments, run.folder, run.environment)
+            self._running.announce(guardian)
         else:
             self._running = ToolProcess(self._program, [self._path, *arguments], run)
-        self._running.announce(reaper)
         return f"{self._program}: a window on this display"
 
     def finish(self) -> None:

@@ -11,7 +11,7 @@ from neuros_dashboard import viewer
 from neuros_dashboard.viewer import Shown, Viewer, Views
 
 from neuros.errors import EnvironmentFault
-from neuros.ports import BackEnd, Reaper
+from neuros.ports import BackEnd, Guardian
 from neuros.project.load import load_project
 from neuros.registry import BACK_ENDS
 
@@ -33,7 +33,7 @@ class Screen(Viewer):
             raise EnvironmentFault(self.why_not)
         return self
 
-    def start(self, run: Shown, reaper: Reaper) -> str:
+    def start(self, run: Shown, guardian: Guardian) -> str:
         return f"{self.name}: open on {run.project.name}"
 
     def finish(self) -> None:
@@ -62,7 +62,7 @@ def started(views: Views) -> list[str]:
     """What the user is told."""
     lines: list[str] = []
     run = Shown("id", CLOCK, {}, {}, load_project(CLOCK, workspace=CLOCK).project, ["clock"], False)
-    views.start(run, cast("Reaper", None), lambda _, line: lines.append(line))
+    views.start(run, cast("Guardian", None), lambda _, line: lines.append(line))
     return lines
 
 

@@ -125,7 +125,7 @@ def without_limits(nodes: Sequence[Node], unkept: Collection[str]) -> Sequence[N
 class DockerLauncher:
     """Starts one container per node (:class:`neuros.ports.Launcher`).
 
-    The reaper gets the engine, and the folder that the containers share, before the first
+    The guardian gets the engine, and the folder that the containers share, before the first
     container.
     """
 
@@ -141,9 +141,9 @@ class DockerLauncher:
         run_id = environment.get(RUN_ID, "")
         folder = shared_memory(run_id)
         socket = engine_socket(self._engine)
-        if self._program.reaper:
-            self._program.reaper.clean_with(leftovers.__name__, socket)
-            self._program.reaper.remove_later(folder)
+        if self._program.guardian:
+            self._program.guardian.clean_with(leftovers.__name__, socket)
+            self._program.guardian.remove_later(folder)
         try:
             folder.mkdir(mode=0o700)
             hold(folder)

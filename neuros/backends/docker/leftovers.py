@@ -1,6 +1,6 @@
-"""Resumes and removes the containers that a launcher leaves; the reaper runs this.
+"""Resumes and removes the containers that a launcher leaves; the guardian runs this.
 
-It speaks HTTP with the engine itself: the reaper has only the standard library.
+It speaks HTTP with the engine itself: the guardian has only the standard library.
 """
 
 from __future__ import annotations

@@ -10,7 +10,15 @@ from typing import Any
 
 from neuros.errors import EnvironmentFault
 from neuros.options import Option
-from neuros.ports import BackEnd, Finding, LaunchExtension, MachineCheck, Reaper, Shown, Subcommand
+from neuros.ports import (
+    BackEnd,
+    Finding,
+    Guardian,
+    LaunchExtension,
+    MachineCheck,
+    Shown,
+    Subcommand,
+)
 
 COMMAND = Subcommand("neuros_diary", "print the diary of runs")
 
@@ -40,7 +48,7 @@ class Entry:
     def __init__(self, text: str) -> None:
         self._text = text
 
-    def start(self, run: Shown, reaper: Reaper, log: Callable[[str, str], None]) -> None:
+    def start(self, run: Shown, guardian: Guardian, log: Callable[[str, str], None]) -> None:
         with diary_file(os.environ).open("a", encoding="utf-8") as file:
             file.write(f"{run.project.name}: {self._text} ({run.folder})\n")
 

@@ -75,8 +75,8 @@ class NiceLauncher:
         started: list[NiceNode] = []
         for node in nodes:
             process = node_process(self._program, node, environment)
-            assert self._program.reaper is not None
-            child = self._program.reaper.spawn(
+            assert self._program.guardian is not None
+            child = self._program.guardian.spawn(
                 [*self._prefix, *process.command],
                 process.log,
                 process.folder,

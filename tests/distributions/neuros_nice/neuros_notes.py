@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from neuros.ports import BackEnd, Reaper
+from neuros.ports import BackEnd, Guardian
 from neuros.viewers.viewer import Shown, Viewer
 
 
@@ -13,7 +13,7 @@ class Note:
 
     path = Path("/nowhere")
 
-    def start(self, run: Shown, reaper: Reaper) -> str:
+    def start(self, run: Shown, guardian: Guardian) -> str:
         self.path = run.folder / "note.txt"
         self.path.write_text(f"{run.project.name}: {', '.join(run.names)}\n")
         return f"notes: {self.path}"

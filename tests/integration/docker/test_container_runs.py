@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import psutil
 import pytest
 from container_bench import HOLDS_THE_GIL, ContainerBench, container_bench
 from endings import GONE_WITHIN_S, RUNS
@@ -23,8 +24,8 @@ from neuros.backends.control_sockets import SOCKET_NAME
 from neuros.backends.docker.engine import engine_socket
 from neuros.backends.docker.launcher import Containers, DockerLauncher
 from neuros.backends.docker.settings import container_name, shared_memory
-from neuros.backends.run_processes import RUN_ID, environ_of
-from neuros.backends.sessions import RunOnThisMachine, reaper_environment
+from neuros.backends.run_processes import RUN_ID
+from neuros.backends.sessions import RunOnThisMachine
 from neuros.errors import EnvironmentFault
 from neuros.ports import NodeProgram
 from neuros.project.load import load_project
@@ -351,13 +352,13 @@ def test_no_paused_container_outlives_a_killed_launcher_either(bench: ContainerB
 
 
 @pytest.mark.acceptance
-def test_killed_together_with_its_reaper_what_is_left_goes_with_the_next_run(
+def test_killed_together_with_its_guardian_what_is_left_goes_with_the_next_run(
     bench: ContainerBench,
 ) -> None:
     bench.project({"a": RUNS})
     running = bench.start_and_wait("a")
     session = bench.session(running)
-    for pid in (reaper_of(session), running.process.pid):
+    for pid in (guardian_of(session), running.process.pid):
         os.kill(pid, signal.SIGKILL)
     running.process.wait()
     memory, control = shared_memory(session.run), Path(session.folder, SOCKET_NAME)
@@ -526,13 +527,14 @@ def pause(bench: ContainerBench, running: Running) -> None:
         container.pause()
 
 
-def reaper_of(session: RunOnThisMachine) -> int:
-    """The number of the process whose environment describes the run."""
-    mark = next(f"{key}={value}" for key, value in reaper_environment(session).items()).encode()
-    (pid,) = [
-        pid for pid in map(int, filter(str.isdigit, os.listdir("/proc"))) if mark in environ_of(pid)
+def guardian_of(session: RunOnThisMachine) -> int:
+    """The number of the process that was started with the id of the run, and is no fork."""
+    (guardian,) = [
+        process
+        for process in psutil.process_iter(["cmdline"])
+        if process.info["cmdline"] and process.info["cmdline"][-1] == session.run
     ]
-    return pid
+    return int(guardian.pid)
 
 
 def finish_stopped(running: Running) -> Finished:
