@@ -28,95 +28,15 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-<<<<<<< HEAD
-<<<<<<< HEAD
-<<<<<<< HEAD
-<<<<<<< HEAD
-<<<<<<< HEAD
-<<<<<<< HEAD
-<<<<<<< HEAD
-    hold("lines of neuros/", lines(NEUROS), 55_720)
+    hold("lines of neuros/", lines(NEUROS), 53_190)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_380)
-=======
-    hold("lines of neuros/", lines(NEUROS), 53_230)
-
-
-def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_320)
->>>>>>> refs/h/uv
-=======
-    hold("lines of neuros/", lines(NEUROS), 53_220)
-
-
-def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_310)
->>>>>>> refs/h/path
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 72_080)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-<<<<<<< HEAD
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 91_380)
-=======
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 89_690)
->>>>>>> refs/h/bench
-=======
-    hold("lines of neuros/", lines(NEUROS), 53_330)
-
-
-def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_640)
-
-
-def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 91_260)
->>>>>>> refs/h/corpus
-=======
-    hold("lines of neuros/", lines(NEUROS), 52_610)
-
-
-def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_130)
-
-
-def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 90_550)
->>>>>>> refs/h/project
-=======
-    hold("lines of neuros/", lines(NEUROS), 53_280)
-
-
-def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_670)
-
-
-def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 90_460)
->>>>>>> refs/h/cluster
-=======
-    hold("lines of neuros/", lines(NEUROS), 53_480)
-
-
-def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_560)
-
-
-def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 90_420)
->>>>>>> refs/h/vt
-=======
-    hold("lines of neuros/", lines(NEUROS), 53_460)
-
-
-def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_540)
-
-
-def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 90_460)
->>>>>>> refs/h/middle
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 91_090)
 
 
 def test_private_functions_that_are_used_once() -> None:

@@ -58,7 +58,7 @@ def pack(run: str | os.PathLike[str], file: str | os.PathLike[str], *, wheels: b
     """
     from neuros.api.project import StartOptions
     from neuros.api.run_record import open_run
-    from neuros.project.paths import files_to_copy
+    from neuros.project.files_to_copy import files_to_copy
     from neuros.project.repeatable import why_not_repeatable
     from neuros_analysis.forking import repeated, why_not_repeated
 

@@ -41,6 +41,7 @@ from neuros.distribution import WORKSPACE, libraries, python_command
 from neuros.errors import ProjectError, UsageError
 from neuros.options import options_of
 from neuros.ports import JobResources
+from neuros.project.files_to_copy import files_to_copy
 from neuros.project.load import PROJECT_FILE
 from neuros.project.model import Folders, Node, NodeFile, Project, memory_text
 from neuros.project.paths import NOT_COPIED
@@ -48,7 +49,6 @@ from neuros.project.split import split, translated
 from neuros.project.suggest import did_you_mean
 from neuros_cluster.command import ExportOptions, check_names
 from neuros_cluster.part import parts_to_json
-from neuros_cluster.project_files import files_to_copy
 from neuros_cluster.slurm import filled, slurm_script
 
 ROOT = Path("/neuros")

@@ -1,4 +1,4 @@
-"""Files of a project that go into its images."""
+"""Files of a project that go into its images and packs."""
 
 from __future__ import annotations
 
