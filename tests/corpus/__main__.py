@@ -66,7 +66,7 @@ def _row(name: str, outcomes: Sequence[Outcome]) -> str:
     cells = [
         *(name, len(outcomes), len(loaded), len(outcomes) - len(loaded)),
         *(f"{sum(getattr(o, key) for o in outcomes):,}" for key in ("bodies", "joints", "said")),
-        f"{max((o.apart_m for o in outcomes), default=0.0):.0e} m",
+        f"{max(o.apart_m for o in loaded):.0e} m" if loaded else "",
     ]
     return f"| {' | '.join(map(str, cells))} |"
 
