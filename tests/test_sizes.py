@@ -28,7 +28,7 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 53_220)
+    hold("lines of neuros/", lines(NEUROS), 53_230)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
@@ -55,10 +55,10 @@ def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, int]:
 @pytest.mark.parametrize(
     ("what", "ceiling"),
     [
-        ("calls of a round", 54),
-        ("files of a round", 16),
-        ("functions before a hook", 745),
-        ("files before a hook", 67),
+        ("calls of a round", 49),
+        ("files of a round", 15),
+        ("functions before a hook", 735),
+        ("files before a hook", 64),
     ],
 )
 def test_calls_in_a_node(what: str, ceiling: int, calls: dict[str, int]) -> None:
