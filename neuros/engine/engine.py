@@ -11,6 +11,7 @@ The engine acts on the world through :class:`Effects` only.
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
@@ -74,10 +75,13 @@ class Engine:
         spent_ns: wall time by cause; each hook counts its own executions.
         execution_log: the first executions.
         sim_clock: simulated time, as far as the node knows it.
+        event_log: its events, where they are recorded (:mod:`neuros.engine.event_log`).
 
     Raises:
         HookError: if a hook names an unknown port, or requires an input that nothing feeds.
     """
+
+    event_log: array[int] | None = None
 
     def __init__(
         self,

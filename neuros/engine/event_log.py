@@ -65,8 +65,8 @@ class LoggedEngine(Engine):
         clock: Callable[[], int],
         packet_types: Mapping[str, PacketType] | None = None,
     ) -> None:
-        self.event_log = array("q")
-        self._record = self.event_log.append
+        self.event_log = log = array("q")
+        self._record = log.append
         record = self._record
 
         def recorded_clock() -> int:

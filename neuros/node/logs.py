@@ -47,7 +47,6 @@ from pathlib import Path
 from typing import Any
 
 from neuros.engine.engine import Engine
-from neuros.engine.event_log import LoggedEngine
 from neuros.ports import Logger, WorldLook
 from neuros.project.model import Connection
 
@@ -156,7 +155,7 @@ class PacketLog:
                 self._lists[name] = _List(
                     self._folder / name,
                     self._list_bytes if is_of_packets else MOST_BYTES,
-                    keeps_first=not is_of_packets or isinstance(self._engine, LoggedEngine),
+                    keeps_first=not is_of_packets or self._engine.event_log is not None,
                 )
             self._folder.mkdir(parents=True, exist_ok=True)
             self._lists[name].append(data)
@@ -178,7 +177,7 @@ class PacketLog:
         yield "pauses", self._engine.pauses.still_ns
         yield "executions", self._engine.execution_log.executions
         yield "credits", self._engine.execution_log.credits
-        if isinstance(self._engine, LoggedEngine):
+        if self._engine.event_log is not None:
             yield EVENT_LOG, self._engine.event_log
         for connection, digests in self._digests.items():
             yield f"{connection.index}.digests", digests

@@ -21,7 +21,6 @@ import neuros.control as control
 from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Advance, Message
 from neuros.control.link import ControlLink
 from neuros.engine.engine import Engine
-from neuros.engine.event_log import LoggedEngine
 from neuros.errors import ControlError, NeurosError
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import as_node_error, callback_error
@@ -383,6 +382,11 @@ class NodeProcess:
 
     def _add(self, file: NodeFile) -> None:
         assert self._middleware is not None
+        make_engine: type[Engine] = Engine
+        if self._open_recorder is not None:
+            from neuros.engine.event_log import LoggedEngine
+
+            make_engine = LoggedEngine
         node = NodeRuntime(
             file,
             self._middleware,
@@ -390,7 +394,7 @@ class NodeProcess:
             tell=self._tell,
             fail=self._fail,
             recorder=None if self._open_recorder is None else self._open_recorder(file),
-            make_engine=Engine if self._open_recorder is None else LoggedEngine,
+            make_engine=make_engine,
             log_file=file.folders.run / file.node.name / "node.log" if self._own_logs else None,
             duration_sim_s=self._duration_sim_s,
             is_held=self._is_held,

@@ -12,7 +12,6 @@ import pytest
 
 from neuros.api.packets import read_packets
 from neuros.engine.connection_ends import SendWindow, Subscription
-from neuros.engine.event_log import LoggedEngine
 from neuros.engine.hook import Hook
 from neuros.engine.schedule import ExecutionLog
 from neuros.hooks import HookKind, HookSpec
@@ -32,6 +31,7 @@ def node() -> Any:
         subscriptions=subscriptions,
         execution_log=ExecutionLog(),
         pauses=SimpleNamespace(still_ns=array("q")),
+        event_log=None,
     )
 
 
@@ -123,10 +123,8 @@ def test_a_list_keeps_the_newest_packets_and_no_more_than_it_may(
 
 
 def test_in_a_recorded_run_a_list_keeps_the_first_packets(tmp_path: Path, node: Any) -> None:
-    recorded = LoggedEngine.__new__(LoggedEngine)
-    parts = {"_pause" if name == "pauses" else name: part for name, part in vars(node).items()}
-    vars(recorded).update(parts, event_log=array("q", [-1, -2, -3]))
-    log = PacketLog(recorded, {}, tmp_path, list_bytes=16)
+    node.event_log = array("q", [-1, -2, -3])
+    log = PacketLog(node, {}, tmp_path, list_bytes=16)
     for time_ns in (1, 2, 3):
         node.send_windows[LEAVING].spend(time_ns)
         log.write()
