@@ -152,6 +152,7 @@ def look_ahead(integrator, seconds):
     return headings
 
 
+@pytest.mark.acceptance
 def test_the_bias_of_the_gyroscope_is_learnt_from_what_it_and_vision_differ_by(load):
     pytest.importorskip("nest")
     integrator = load("correction").CorrectedIntegrator(1, -0.1, 300.0, 0.3, learning_per_s2=1.0)
