@@ -83,8 +83,12 @@ def pack(run: str | os.PathLike[str], file: str | os.PathLike[str], *, wheels: b
                 ignore=lambda at, names: [name for name in names if Path(at, name) not in found],
             )
             shutil.copytree(folder, draft / "run", ignore=left_out)
-            own = importlib.metadata.distribution("neuros")
-            metadata = Path(str(own.locate_file(f"neuros-{own.version}.dist-info")))
+            # A checkout in which a wheel was built has a neuros.egg-info that comes first.
+            metadata = next(
+                place
+                for own in importlib.metadata.distributions(name="neuros")
+                if (place := Path(str(own.locate_file(f"neuros-{own.version}.dist-info")))).is_dir()
+            )
             for name, place in {**libraries(), metadata.name: metadata}.items():
                 shutil.copytree(place, draft / "lib" / name, ignore=left_out)
             if timing := given.get("timing"):

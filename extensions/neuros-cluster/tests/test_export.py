@@ -307,7 +307,7 @@ def test_links_out_of_the_project_or_in_a_circle_and_devices_are_all_named_befor
 def test_links_that_stand_for_ever_more_files_are_refused(
     project: Project, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuros_cluster.project_files._MOST_LINKED", 1000)
+    monkeypatch.setattr("neuros.project.files_to_copy._MOST_LINKED", 1000)
     (project.folder / "d0").mkdir()
     for number in range(1, 40):
         folder = project.folder / f"d{number}"
