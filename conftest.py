@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from importlib import import_module
 
 import pytest
-from hypothesis import HealthCheck, Phase, settings
+from hypothesis import HealthCheck, settings
 from marking import Watch, longest_first, mark
 from needs import require, summary
 
@@ -26,14 +26,8 @@ WATCH = Watch()
 
 # How long examples take depends on what else the machine does.
 settings.register_profile("anywhere", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-# For tests/mutation.py: the same examples each time, and none made smaller when one fails.
-settings.register_profile(
-    "mutation",
-    settings.get_profile("anywhere"),
-    derandomize=True,
-    database=None,
-    phases=[Phase.explicit, Phase.generate],
-)
+# pytest tests/fuzz --hypothesis-profile=long: an hour or two.
+settings.register_profile("long", settings.get_profile("anywhere"), max_examples=20_000)
 settings.load_profile("anywhere")
 
 

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from tabulate import tabulate
 
-from benchmarks import against, comparing, page, running, subjects
+from benchmarks import against, page, running, subjects
 from benchmarks.interruption import interrupted_by_termination
 from benchmarks.machine import ROOT
 from benchmarks.measure import Subject
-from benchmarks.results import Results, combine, differences, utc_time
+from benchmarks.results import Results, utc_time
 from benchmarks.table import LEGEND, notice_lines, rows_table, targets_table
 from benchmarks.targets import TARGETS
 from neuros.errors import UsageError
@@ -31,10 +30,6 @@ def run(options: argparse.Namespace) -> int:
     if options.list:
         print(_list())
         return 0
-    if options.compare:
-        a, b = (Results.read(Path(file)) for file in options.compare)
-        print(comparing.report(a, b))
-        return 0
     if options.against:
         pairs = against.measure(
             options.against,
@@ -44,10 +39,10 @@ def run(options: argparse.Namespace) -> int:
             rounds=options.rounds,
             is_quick=options.quick,
         )
-        print(against.table(pairs))
+        print(against.table(pairs) if pairs else "nothing was compared")
         return int(any(pair.verdict == "slower" for pair in pairs))
-    if options.files:
-        results, code = _combined([Path(file) for file in options.files]), 0
+    if options.file:
+        results, code = Results.read(Path(options.file)), 0
     else:
         results, code = _measure(options)
     print(_report(results, is_whole=not (options.subjects or options.rows)))
@@ -70,15 +65,6 @@ def _measure(options: argparse.Namespace) -> tuple[Results, int]:
         code = 130
     _say(f"all values: {file}")
     return results, code or int(any(notice.is_failure for notice in results.notices))
-
-
-def _combined(files: Sequence[Path]) -> Results:
-    """The results of several files, with a warning where they do not belong together."""
-    parts = [Results.read(file) for file in files]
-    for file, part in zip(files[1:], parts[1:], strict=True):
-        for difference in differences(parts[0], part):
-            _say(f"warning: {files[0]} and {file} differ in {difference}")
-    return combine(parts)
 
 
 def _only(chosen: dict[str, Subject], text: str) -> dict[str, Subject]:
@@ -109,7 +95,7 @@ def _report(results: Results, is_whole: bool) -> str:
         parts.append(targets_table(results.rows, is_whole=is_whole))
     parts.append(LEGEND)
     parts += ["\n".join(notice_lines(results.notices))] if results.notices else []
-    about = {**results.machine, **results.versions, "commit": results.commits}
+    about = results.machine | results.versions
     parts.append(", ".join(f"{name} {value}" for name, value in about.items()))
     loads = ", ".join(f"{name} {load:.0%}" for name, load in results.load_before.items())
     parts.append(f"busy with other things before: {loads}")

@@ -47,27 +47,21 @@ def add_benchmark(benchmark: argparse.ArgumentParser) -> None:
         help="few and short rounds, to try it out: do not quote the figures",
     )
     add("-o", "--output", metavar="FILE", help="default: build/benchmarks/<utc time>.json")
-    add(
-        "--from",
-        dest="files",
-        nargs="+",
-        metavar="FILE",
-        help="measure nothing; show these results (if several files have a row, that of the last)",
-    )
+    add("--from", dest="file", metavar="FILE", help="measure nothing; show these results")
     add(
         "--against",
         metavar="COMMIT",
         help="measure this checkout and another commit in turn, and show their ratios; exit code 1"
-        " if a row is slower here by 5 %% at least, whatever it is by chance",
+        " if a row is slower here by 5 %% at least, whatever it is by chance; 'landed': the last"
+        " commit of origin's main branch, or the one before",
     )
-    add("--compare", nargs=2, metavar=("A", "B"), help="show what differs between two results")
     add("--write-docs", action="store_true", help="put the tables into docs/numbers.md")
     benchmark.set_defaults(command=_benchmark)
 
 
 def _benchmark(options: argparse.Namespace) -> int:
-    if options.subjects and (options.files or options.compare or options.list):
-        raise UsageError("--from, --compare and --list measure nothing: name no SUBJECT")
+    if options.subjects and (options.file or options.list):
+        raise UsageError("--from and --list measure nothing: name no SUBJECT")
     from benchmarks.command import run
 
     return run(options)

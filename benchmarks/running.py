@@ -29,7 +29,7 @@ def measure(
         rounds: instead of those of the groups.
     """
     for name, subject in subjects.items():
-        results.load_before[name] = load_before()
+        results.load_before[name] = load_before(0.2 if results.is_quick else 1.0)
         say(f"{name} (others keep {results.load_before[name]:.0%} of the cores busy)")
         runs = [Run(group) for group in subject.groups]
         before = replace(results, rows=list(results.rows), notices=list(results.notices))

@@ -6,6 +6,8 @@ import contextlib
 import fcntl
 import os
 import re
+import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +31,22 @@ class Kept:
     def log(self) -> Path:
         """The log of its build."""
         return self.beside(".log")
+
+    @property
+    def draft(self) -> Path:
+        """The folder in which it is built, or removed: half of it must not count as whole."""
+        return self.beside(".draft")
+
+    @property
+    def mark(self) -> Path:
+        """The path that exists if it is whole; its time is that of the last use."""
+        return self.folder
+
+    def remove(self) -> None:
+        """Remove what can be removed, but not the log."""
+        with contextlib.suppress(OSError):
+            self.folder.rename(self.draft)
+        shutil.rmtree(self.draft, ignore_errors=True)
 
     def beside(self, suffix: str) -> Path:
         """The file or folder beside it with this suffix."""
@@ -56,6 +74,24 @@ def kept_in(cache: Path) -> list[Path]:
     """The kept folders of a cache, also those of which only files beside are left."""
     names = {match[1] for path in cache.glob("*") if (match := _NAME.match(path.name))}
     return [cache / name for name in sorted(names)]
+
+
+def sweep(cache: Path, kind: type[Kept] = Kept) -> None:
+    """Remove folders that were interrupted, and folders and logs that are unused for a month."""
+    oldest_s = time.time() - UNUSED_S
+    for entry in map(kind, kept_in(cache)):
+        with contextlib.suppress(OSError), entry.locked(wait=False) as is_mine:
+            if not is_mine:
+                continue
+            shutil.rmtree(entry.draft, ignore_errors=True)
+            used_s = 0.0  # for a folder that is not whole
+            if entry.mark.exists():
+                used_s = entry.mark.stat().st_mtime
+            elif entry.log.exists() and not entry.folder.exists():
+                used_s = entry.log.stat().st_mtime
+            if used_s < oldest_s:
+                entry.remove()
+                entry.log.unlink(missing_ok=True)
 
 
 def cache_root(environ: Mapping[str, str]) -> Path:

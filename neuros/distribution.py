@@ -8,8 +8,13 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from importlib.metadata import Distribution, EntryPoint
 
 __version__ = "2.0.0"
 
@@ -52,19 +57,33 @@ def python_command(
     return [str(python), "-c", f"{_LEAVE_OUT_FOLDER}; {code}", *arguments]
 
 
+def extensions() -> Iterator[tuple[Distribution, list[EntryPoint]]]:
+    """The installed distributions with entry points in groups of NeuROS, and these entry points."""
+    from importlib import metadata
+
+    for each in metadata.distributions():
+        entries = [entry for entry in each.entry_points if entry.group.startswith("neuros.")]
+        if entries and each.name != "neuros":
+            yield each, entries
+
+
+def versions() -> str:
+    """A line for NeuROS and for each extension, with its version; they are all the same."""
+    lines = [f"neuros {__version__}"]
+    for name, version in sorted({(each.name, each.version) for each, _ in extensions()}):
+        remedy = f"  (that of neuros is needed: {install_command()})"
+        lines.append(f"{name} {version}{remedy if version != __version__ else ''}")
+    return "\n".join(lines)
+
+
 def libraries() -> dict[str, Path]:
     """What a Python elsewhere needs on its path to import this NeuROS with its extensions.
 
-    These are the package ``neuros`` and, of each distribution with an entry point in a group of
-    NeuROS, its packages and its metadata; by the names that they have on the path.
+    These are the package ``neuros`` and, of each extension, its packages and its metadata; by the
+    names that they have on the path.
     """
-    from importlib import metadata
-
     found = {PACKAGE.name: PACKAGE}
-    for each in metadata.distributions():
-        entries = [entry for entry in each.entry_points if entry.group.startswith("neuros.")]
-        if not entries or each.name == "neuros":
-            continue
+    for each, entries in extensions():
         for name in {entry.module.partition(".")[0] for entry in entries}:
             spec = find_spec(name)
             for place in (spec.submodule_search_locations or ()) if spec else ():

@@ -62,6 +62,7 @@ PACKAGES = (
     Package(7, ("api",)),
     Package(7, ("testing",)),
     Package(8, ("pytest_plugin",)),
+    Package(8, ("ros_launch",)),
     Package(8, ("cli", "doctor")),
 )
 # neuros itself holds public names; every package may ask it for the version. Those of others
@@ -109,6 +110,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "backends.console": {"tqdm"},
     "backends.virtual_environments": {"packaging"},
     "pytest_plugin": {"pytest"},
+    "ros_launch": {"launch"},
     "api.packets": {"numpy", "xxhash"},
     "api.run_record": {"tabulate"},
     "api.session": {"numpy"},

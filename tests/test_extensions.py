@@ -69,6 +69,39 @@ def test_an_extension_has_the_version_of_the_core_and_asks_for_it(folder: Path) 
 
 
 @each_extension
+def test_its_facts_are_those_of_the_core_and_its_page_tells_how_it_is_installed(
+    folder: Path,
+) -> None:
+    core, text = ((each / "pyproject.toml").read_text("utf-8") for each in (ROOT, folder))
+    for line in re.findall(r"^(?:license|authors|requires-python) = .*$", core, re.MULTILINE):
+        assert f"\n{line}\n" in text
+    name = folder.name.removeprefix("neuros-")
+    page = (folder / "README.md").read_text("utf-8").partition("\n## ")[0]
+    wanted = f"`./install.py` installs it, `pip install 'neuros[{name}]'` does so elsewhere."
+    assert f"extension `{folder.name}`: {wanted}" in " ".join(page.split())
+
+
+def test_the_version_is_shown_with_those_of_the_extensions(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out.splitlines()
+    assert shown == [f"{name} {__version__}" for name in ("neuros", *(f.name for f in FOLDERS))]
+
+
+def test_an_extension_of_another_version_is_told_apart(tmp_path: Path) -> None:
+    metadata = tmp_path / "neuros_lab-1.0.dist-info"
+    metadata.mkdir()
+    text = "Metadata-Version: 2.1\nName: neuros-lab\nVersion: 1.0\n"
+    (metadata / "METADATA").write_text(text, "utf-8")
+    (metadata / "entry_points.txt").write_text("[neuros.names]\nlab = lab\n", "utf-8")
+    shown = output_of("from neuros.distribution import versions; print(versions())", tmp_path)
+    assert "\nneuros-lab 1.0  (that of neuros is needed: ./install.py)\n" in shown
+
+
+@each_extension
 def test_what_an_extension_brings_can_be_loaded(folder: Path) -> None:
     for group, names in sections(folder / package(folder) / "entry_points.txt").items():
         for name, value in names.items():

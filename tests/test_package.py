@@ -30,10 +30,10 @@ from neuros.installation.progress import Progress
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ("containers", "examples", "schema", "workspace")
-SOURCES = ("neuros", *DATA, "tests/integration/back_ends")
+SOURCES = ("neuros", "resource", *DATA, "tests/integration/back_ends")
 SCREENSHOTS = ROOT / "build" / "screenshots"
 IS_DRAWN = "() => Number(document.querySelector('#world').dataset.drawn ?? 0) > 2"
-FILES = ("pyproject.toml", "MANIFEST.in", "README.md", "LICENSE")
+FILES = ("pyproject.toml", "setup.py", "package.xml", "MANIFEST.in", "README.md", "LICENSE")
 LEFT_BEHIND = shutil.ignore_patterns("__pycache__", "runs", "build", "*.egg-info")
 EXTENSIONS = sorted(ROOT.glob("extensions/*"))
 PYTHONS = [(3, minor) for minor in range(10, NEWEST_FOR_NEST[1] + 1)]

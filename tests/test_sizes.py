@@ -28,19 +28,19 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 52_610)
+    hold("lines of neuros/", lines(NEUROS), 52_680)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_130)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 71_100)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 90_550)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 90_210)
 
 
 def test_private_functions_that_are_used_once() -> None:
-    hold("percent of the functions of neuros/", used_once_percent(NEUROS), 6.68)
+    hold("percent of the functions of neuros/", used_once_percent(NEUROS), 6.18)
 
 
 def test_public_classes_of_one_name() -> None:

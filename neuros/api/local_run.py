@@ -33,17 +33,19 @@ from neuros.launcher.outcome import EXIT_CODES, Outcome
 from neuros.launcher.quiescence import Declarations
 from neuros.node.context import ContextSwitch
 from neuros.node.failures import callback_error
+from neuros.node.instruments import PacketHistory
 from neuros.node.node import NodeRuntime
 from neuros.node.reports import declared
 from neuros.options import recorded_values
 from neuros.ports import Changes
 from neuros.project.loops import modules_beside
-from neuros.project.model import Node, NodeFile
+from neuros.project.model import Node, NodeFile, Port
 from neuros.project.plugin_files import read_plugin
 from neuros.recording.provenance import GitState, provenance
 from neuros.runtime.local import LocalLoop, LocalMiddleware, Record, log_in_python
 from neuros.runtime.virtual import VirtualLoop, VirtualMiddleware
 from neuros.transport.digests import digest_of
+from neuros.transport.messages import copier_of
 
 NAME = "local"
 """Of this back end, in ``session(backend=...)`` and in ``run.json``."""
@@ -98,7 +100,7 @@ class LocalRun:
         self._has_begun = self._is_active = False
         self._next_report_s = self._started_s + _REPORT_S
         self._is_behind = False
-        self._sent: list[Callable[[], None]] = []
+        self._sent: list[tuple[NodeRuntime, Port, Any]] = []
         self._is_shown = bool(getattr(request, "show", False))
         arguments = (self._write, self._fail_in_callback)
         keywords: dict[str, Any] = {
@@ -113,6 +115,7 @@ class LocalRun:
             self._middleware = VirtualMiddleware(loop, *arguments, **keywords)
         self._contexts.hide_from_nodes(project.folder)
         self._nodes: dict[str, NodeRuntime] = {}
+        self._histories: dict[str, PacketHistory] = {}  # of outputs that a session has read
         self._thread = _Thread(
             self.folder,
             self._loop,
@@ -167,12 +170,11 @@ class LocalRun:
                 self._is_behind = True
                 is_driven = False
                 for node in nodes:
-                    engine = node.engine
-                    is_driven = is_driven or (engine is not None and engine.is_driving)
+                    is_driven = is_driven or node.loaded.is_driving
                 for node in nodes:
                     node.step(1, is_driven=is_driven)
                 self._come_to_rest()
-                if self._failed_or_over():
+                if self._end is not None or self._outcome.failures:
                     break
         return self._rest(known)
 
@@ -195,15 +197,13 @@ class LocalRun:
             self._come_to_rest()
         return self._rest(known)
 
-    def deliver(self, node: str, input_name: str, packet: Any) -> None:
+    def deliver(self, node: str, port: Port, packet: Any) -> None:
         """Put a packet into the queue of an input, where the next round finds it."""
-        port = self._nodes[node].file.node.input(input_name)
-        own = self.copy(port.type, packet)
-        self._sent.append(partial(self._nodes[node].on_external_packet, port, own))
+        self._sent.append((self._nodes[node], port, copier_of(port.type)(packet)))
 
     def copy(self, type_name: str, content: Any) -> Any:
         """A packet of its own for the program."""
-        return self._middleware.packets.copier(type_name)(content)
+        return copier_of(type_name)(content)
 
     def view(self, type_name: str, content: Any) -> Any:
         """The packet that the run keeps itself."""
@@ -238,6 +238,7 @@ class LocalRun:
             return False
         with self._thread.until():
             self._sent.clear()
+            self._histories.clear()
             for node in nodes:
                 node.pause()  # takes back what is left of steps, which might go on for ever
             self._loop.run_until_idle()
@@ -348,20 +349,23 @@ class LocalRun:
         self._loop.run_until_idle()
         self._is_behind = False
         for node in self._nodes.values():
-            node.pause()
+            node.loaded.pause()
 
     def _deliver_sent(self) -> None:
         """Put what the program has sent into the queues, before a round begins."""
         sent, self._sent = self._sent, []
-        for deliver in sent:
-            deliver()
+        for node, port, packet in sent:
+            node.on_external_packet(port, packet)
 
     def _sim_times(self) -> dict[str, float]:
-        nodes = self._nodes.values()
-        return {node.name: time_s for node in nodes if (time_s := node.sim_time) is not None}
+        times = {}
+        for name, node in self._nodes.items():
+            if node.time.read_s is not None:
+                times[name] = node.time.read_s()
+        return times
 
     def _rest(self, known: Mapping[str, int]) -> AtRest | None:
-        if self._failed_or_over():
+        if self._end is not None or self._outcome.failures:
             self._finish()
             return None
         if (now_s := time.monotonic()) >= self._next_report_s:
@@ -371,9 +375,14 @@ class LocalRun:
                 self._outcome.add(node.reports.report(), now_s)
         packets = {}
         for name, number in known.items():
-            node_name, _, output = name.partition(".")
-            history = self._nodes[node_name].histories.by_output.get(output)
-            if history is not None and history.count > number:
+            history = self._histories.get(name)
+            if history is None:
+                owner, _, output = name.partition(".")
+                history = self._nodes[owner].histories.by_output.get(output)
+                if history is None:
+                    continue
+                self._histories[name] = history
+            if history.count > number:
                 packets[name] = history.count, history.since(number)
         return AtRest(0, self._sim_times(), packets)
 
@@ -551,7 +560,9 @@ class _Thread:
 
     turn = threading.RLock()
     _open = 0  # sessions
-    _interruptible: ClassVar[LocalLoop | None] = None  # while nodes run in the main thread
+    # Loops whose nodes run in the main thread, outermost first. An attribute of the class that
+    # changed with each step would have Python look up all its methods anew.
+    _interruptible: ClassVar[list[LocalLoop]] = []
 
     def __init__(
         self,
@@ -568,8 +579,7 @@ class _Thread:
         self._describe_hang = describe_hang
         self._on_hang = on_hang
         self._watchdog: _Watchdog | None = None
-        self._is_inside = False
-        self._outer: LocalLoop | None = None
+        self._is_inside = self._is_interruptible = False
         self._left_s = -math.inf
         self._others: set[threading.Thread] = set()
         self._count = -1  # of threads, when the others were looked up
@@ -592,15 +602,17 @@ class _Thread:
 
     def until(self, end_s: float | None = None) -> _Thread:
         """The thread for nodes; they are interrupted at a time (monotonic, seconds)."""
-        self.check_outside()
+        if self._is_inside:
+            self.check_outside()
         if end_s is not None:
             self._watchdog = _Watchdog(end_s, self._loop, self._describe_hang)
         return self
 
     def __enter__(self) -> None:
         watchdog = self._watchdog
-        left_s = -1.0 if watchdog is None else max(0.0, watchdog.end_s - time.monotonic())
-        if not self.turn.acquire(timeout=left_s):
+        if watchdog is None:
+            self.turn.acquire()
+        elif not self.turn.acquire(timeout=max(0.0, watchdog.end_s - time.monotonic())):
             self._watchdog = None
             raise TimeoutError("a hook of another session has not returned in time")
         try:
@@ -609,12 +621,12 @@ class _Thread:
             if time.monotonic() - self._left_s > _CELL_S:
                 self._handle_interrupts()
             self._is_inside = True
-            self._outer = _Thread._interruptible
-            _Thread._interruptible = self._outer or (self._loop if _is_main() else None)
+            if threading.get_ident() == _MAIN.ident:
+                self._is_interruptible = True
+                self._interruptible.append(self._loop)
             os.fchdir(self._folder)
         except BaseException:
-            self._is_inside = False
-            self.turn.release()
+            self._end_inside()
             raise
         # threading.active_count() takes thirty times as long.
         if (count := _thread._count()) != self._count:
@@ -639,9 +651,7 @@ class _Thread:
             self._begun = {thread for thread in begun if thread.is_alive()}
         self._leave()
         os.fchdir(self._program_folder)
-        # From here on, Ctrl+C is the program's again.
-        _Thread._interruptible, self._is_inside = self._outer, False
-        self.turn.release()
+        self._end_inside()
         self._left_s = time.monotonic()
         interruption, self._loop.interruption = self._loop.interruption, None
         if hang:
@@ -660,6 +670,14 @@ class _Thread:
             if not _Thread._open and _is_main() and _handler() is _Thread._on_interrupt:
                 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+    def _end_inside(self) -> None:
+        """From here on, Ctrl+C is the program's again."""
+        if self._is_interruptible:
+            self._is_interruptible = False
+            self._interruptible.pop()
+        self._is_inside = False
+        self.turn.release()
+
     def _note_folder(self) -> None:
         try:
             path = os.getcwd()
@@ -677,11 +695,11 @@ class _Thread:
 
     @staticmethod
     def _on_interrupt(number: int, frame: FrameType | None) -> None:
-        loop = _Thread._interruptible
-        if loop is None or loop.interruption is not None:
+        loops = _Thread._interruptible
+        if not loops or loops[0].interruption is not None:
             signal.default_int_handler(number, frame)
         else:
-            loop.interrupt(KeyboardInterrupt())
+            loops[0].interrupt(KeyboardInterrupt())
 
 
 def _uses_nest(node: Node) -> bool:
@@ -696,8 +714,11 @@ def _handler() -> object:
     return signal.getsignal(signal.SIGINT)
 
 
+_MAIN = threading.main_thread()
+
+
 def _is_main() -> bool:
-    return threading.get_ident() == threading.main_thread().ident
+    return threading.get_ident() == _MAIN.ident
 
 
 class _Watchdog:

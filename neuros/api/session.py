@@ -180,9 +180,10 @@ class Session:
                 and for a length that is no number, negative or not finite.
         """
         count = check_length(rounds, sim_s, until)
-        end_s = _end_of(timeout_s)
+        end_s = None if timeout_s is None else _end_of(timeout_s)
         with self._lock:
-            self._check_running()
+            if self._run is not None:
+                self._check_running()
             if until is not None and self._held.is_behind and not self._advance(0, end_s):
                 return False
             is_counted = sim_s is None and until is None
@@ -190,7 +191,7 @@ class Session:
                 self._unnoted += 1
                 if not self._take(self._held.advance(1, self._known, end_s)):
                     return False
-            return self.is_running  # `until` may have closed it
+            return self._run is None  # `until` may have closed it
 
     async def astep(self, rounds: int | None = None, **options: Any) -> bool:
         """As :meth:`step`, for coroutines."""
@@ -470,11 +471,12 @@ class Session:
         node, port = self._ports[input_name]
         packet = checked(port, message)
         with self._lock:
-            self._check_running()
-            self._held.deliver(node.name, port.name, packet)
+            if self._run is not None:
+                self._check_running()
+            self._held.deliver(node.name, port, packet)
             if self._is_forkable:
                 own = RosPackets().copier(port.type)(packet)
-                self._note("send", node.name, port.name, own)
+                self._note("send", node.name, port, own)
             elif not self._why_no_fork:
                 self._why_no_fork = (
                     f"{input_name} was sent packets that are not kept: begin it with"

@@ -87,7 +87,7 @@ class HeldRun(Protocol):
     def run_for(self, duration_s: float, known: Mapping[str, int]) -> AtRest | None:
         """Let the run go freely for a wall time, then hold it again, and wait for that."""
 
-    def deliver(self, node: str, input_name: str, packet: Any) -> None:
+    def deliver(self, node: str, port: Port, packet: Any) -> None:
         """Put a packet, which has been checked, into the queue of an input."""
 
     def copy(self, type_name: str, content: Any) -> Any:
@@ -200,8 +200,8 @@ class LaunchedRun:
             self._send(Pause())
         return self.advance(0, known)
 
-    def deliver(self, node: str, input_name: str, packet: Any) -> None:
-        self._send(Deliver(node, input_name, self._packets.encode(packet)))
+    def deliver(self, node: str, port: Port, packet: Any) -> None:
+        self._send(Deliver(node, port.name, self._packets.encode(packet)))
 
     def copy(self, type_name: str, content: bytes) -> Any:
         return self._packets.decode(type_name, content)

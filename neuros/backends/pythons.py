@@ -29,10 +29,9 @@ from neuros.backends.virtual_environments import (
     own_needs,
     packages_here,
     read_requirements,
-    sweep,
     unmet,
 )
-from neuros.caching import KEY_LENGTH
+from neuros.caching import KEY_LENGTH, sweep
 from neuros.distribution import PACKAGE
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import NEWEST, OLDEST, answer_of, clean_environment, dotted
@@ -213,7 +212,7 @@ class Pythons:
                 continue
             try:
                 make(choice, progress, run_environment)
-                sweep(choice.entry.folder.parent)
+                sweep(choice.entry.folder.parent, CachedEnvironment)
             except EnvironmentFault as fault:
                 faults.append(str(fault))
         if faults:

@@ -30,14 +30,13 @@ import os
 import re
 import shutil
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neuros.backends.containers import ContainerFolder
-from neuros.caching import UNUSED_S, Kept, cache_root, kept_in
+from neuros.caching import Kept, cache_root
 from neuros.distribution import install_command, libraries, python_command
 from neuros.errors import EnvironmentFault
 from neuros.installation.machine import clean_environment, dotted
@@ -70,7 +69,7 @@ class CachedEnvironment(Kept):
     """One environment, made or not; its log is the output of uv."""
 
     @property
-    def stamp(self) -> Path:
+    def mark(self) -> Path:
         """An empty file: the environment is whole, or the launcher's own Python is enough."""
         has_folder = os.path.exists(self.folder)  # exists() raises in a cache without rights
         return self.folder / "neuros-whole" if has_folder else self.beside(".here")
@@ -81,37 +80,19 @@ class CachedEnvironment(Kept):
         return self.folder / "bin" / "python"
 
     def python(self) -> Path | None:
-        """The Python to run, or ``None`` without a stamp."""
+        """The Python to run, or ``None`` without a mark."""
         python = self.future_python if os.path.exists(self.folder) else Path(sys.executable)
-        return python if os.path.exists(self.stamp) and os.access(python, os.X_OK) else None
+        return python if os.path.exists(self.mark) and os.access(python, os.X_OK) else None
 
     def record_use(self) -> None:
-        """Write the stamp, whose time is that of the last use. Raises ``OSError``."""
+        """Write the mark, whose time is that of the last use. Raises ``OSError``."""
         self.folder.parent.mkdir(parents=True, exist_ok=True)
-        self.stamp.touch()
+        self.mark.touch()
 
     def remove(self) -> None:
-        """Remove what can be removed, but not the log."""
         with contextlib.suppress(OSError):
-            self.stamp.unlink(missing_ok=True)  # first: a part must not count as whole
-        shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def sweep(cache: Path) -> None:
-    """Remove environments that were interrupted or that no run has used for a month."""
-    oldest_s = time.time() - UNUSED_S
-    for entry in map(CachedEnvironment, kept_in(cache)):
-        with contextlib.suppress(OSError), entry.locked(wait=False) as is_mine:
-            if not is_mine:
-                continue
-            used_s = 0.0  # for a folder that is not whole
-            if entry.stamp.exists():
-                used_s = entry.stamp.stat().st_mtime
-            elif entry.log.exists() and not entry.folder.exists():
-                used_s = entry.log.stat().st_mtime
-            if used_s < oldest_s:
-                entry.remove()
-                entry.log.unlink(missing_ok=True)
+            self.mark.unlink(missing_ok=True)
+        super().remove()
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 
 from neuros.cli import EXIT_CODES
 from neuros.cli.terminal import harmless_output
-from neuros.distribution import __version__
+from neuros.distribution import versions
 from neuros.errors import EnvironmentFault, NeurosError, ProjectError, UsageError
 from neuros.options import positive_number, positive_seconds
 from neuros.ordinary_files import cannot_be_opened
@@ -43,21 +43,21 @@ COMMANDS = {
     "types": Subcommand(
         "neuros.cli.projects", "let editors know the fields of a project's messages"
     ),
-    "build": Subcommand("neuros.cli.setup", "build message packages"),
+    "build": Subcommand("neuros.cli.machine", "build message packages"),
     "ps": Subcommand("neuros.cli.live", "show the runs of this user"),
     "stop": Subcommand("neuros.cli.live", "stop a run, as Ctrl+C does"),
     "topic": Subcommand("neuros.cli.live", "show the topics and packets of a run in progress"),
     "logs": Subcommand("neuros.cli.live", "show what the nodes of a run have logged"),
     "verify": Subcommand("neuros.cli.runs", "compare the packets of two runs"),
     "bag": Subcommand("neuros.cli.runs", "show or complete what a run has recorded"),
-    "doctor": Subcommand("neuros.cli.setup", "check this machine, and prove that packets arrive"),
+    "doctor": Subcommand("neuros.cli.machine", "check this machine, and prove that packets arrive"),
     "containers": Subcommand(
-        "neuros.cli.setup", "build, list and remove the images that nodes run in"
+        "neuros.cli.machine", "build, list and remove the images that nodes run in"
     ),
     "benchmark": Subcommand(
-        "neuros.cli.setup", "measure what NeuROS costs, compared with the same program without it"
+        "neuros.cli.machine", "measure what NeuROS costs, compared with the same program without it"
     ),
-    "reproduce": Subcommand("neuros.cli.setup", "repeat the published experiments"),
+    "reproduce": Subcommand("neuros.cli.machine", "repeat the published experiments"),
     "node": Subcommand("neuros.cli.node"),
     "import-plugin": Subcommand("neuros.cli.projects"),
     "recorder": Subcommand("neuros.cli.recorder"),
@@ -231,7 +231,8 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
         epilog=EXIT_CODES,
         formatter_class=_Formatter,
     )
-    result.add_argument("--version", action="version", version=f"neuros {__version__}")
+    text = "show the versions of neuros and its extensions, and exit"
+    result.add_argument("--version", action=_Versions, nargs=0, help=text)
     commands = result.add_subparsers(title="commands", metavar=_COMMAND, required=True)
     shown = COMMANDS
     if command not in COMMANDS:  # what extensions bring takes some 10 ms to find
@@ -251,6 +252,14 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
             else:
                 added.prepare = prepare
     return result
+
+
+class _Versions(argparse.Action):
+    """Looks for extensions, which takes some 10 ms, only where it is asked to."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        print(versions())
+        parser.exit()
 
 
 @cache

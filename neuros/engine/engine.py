@@ -145,10 +145,10 @@ class Engine:
     def on_packet(self, key: Connection | str, packet: Any) -> None:
         """A packet has arrived on a connection, or on the external topic of the input ``key``."""
         self._wake()
-        subscription = self.subscriptions[key]
         self._arrivals += 1
-        subscription.put(self._arrivals, packet)
-        self._pass()
+        self.subscriptions[key].put(self._arrivals, packet)
+        if not self._pause.is_still:
+            self._pass()
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """All hooks at the far end have started on the packets up to ``position``."""
@@ -156,7 +156,7 @@ class Engine:
         self.send_windows[connection].credit(position, now_ns)
         if not self.execution_log.is_full:
             self.execution_log.record_credit(connection, position, now_ns)
-        if self._schedule.candidates:  # else it changes nothing that a pass would find
+        if self._schedule.candidates and not self._pause.is_still:  # else no pass finds more
             self._pass()
 
     def on_registered(self, connection: Connection) -> None:

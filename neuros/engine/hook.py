@@ -25,7 +25,9 @@ class Hook:
         is_enabled: whether the phase of the node lets the hook run.
         turn: grows in the order of priority: least recently executed first.
         candidates: of the whole node, the hooks that are enabled, due and have all inputs; each
-            hook adds and removes itself.
+            hook and its inputs add and remove it.
+        is_open: whether it is enabled and due.
+        lacking: the number of inputs that lack a packet.
         drives: whether it starts again and again without a packet: a tick, or a main loop.
         executions: their number.
         busy_ns: their duration in all.
@@ -35,7 +37,6 @@ class Hook:
     __slots__ = (
         "_is_due",
         "_is_enabled",
-        "_lacking",
         "_results",
         "_windows",
         "blocked",
@@ -45,6 +46,8 @@ class Hook:
         "due_ns",
         "executions",
         "inputs",
+        "is_open",
+        "lacking",
         "loops",
         "missed_ticks",
         "name",
@@ -72,8 +75,8 @@ class Hook:
         self.turn = 0
         self.candidates: set[Hook] = set()
         self._is_due = spec.period_s is None
-        self._is_enabled = False
-        self._lacking = sum(hook_input.missing > 0 for hook_input in self.inputs)
+        self._is_enabled = self.is_open = False
+        self.lacking = sum(hook_input.missing > 0 for hook_input in self.inputs)
         for hook_input in self.inputs:
             hook_input.hook = self
         self.executions = 0
@@ -114,26 +117,13 @@ class Hook:
         self._is_enabled = is_enabled
         self._update_candidates()
 
-    def on_input_complete(self) -> None:
-        """An input of the hook has all packets that it needs."""
-        self._lacking -= 1
-        if not self._lacking and self._is_enabled and self._is_due:
-            self.candidates.add(self)
-
-    def on_input_incomplete(self) -> None:
-        """An input of the hook lacks a packet."""
-        self._lacking += 1
-        self.candidates.discard(self)
-
     def windows(self) -> list[SendWindow]:
         """Every connection that the hook may send on."""
         return list(self._windows)
 
     def is_ready(self) -> bool:
         """Whether the hook may start now, by inputs, outputs, timer and the node's phase."""
-        if not (self._is_enabled and self._is_due) or self._lacking:
-            return False
-        return not self.blocked or self.can_send()
+        return self.is_open and not self.lacking and self.can_send()
 
     def can_send(self) -> bool:
         """Whether no send window is blocked, but by packets that its own start would consume."""
@@ -143,7 +133,7 @@ class Hook:
 
     def awaited_input(self) -> HookInput | None:
         """The first required input without a packet, if the hook waits for inputs alone."""
-        if self._lacking and self._is_enabled and self._is_due:
+        if self.lacking and self.is_open:
             for hook_input in self.inputs:  # next() over a generator takes thrice as long
                 if hook_input.missing:
                     return hook_input
@@ -233,7 +223,8 @@ class Hook:
         )
 
     def _update_candidates(self) -> None:
-        if self._is_enabled and self._is_due and not self._lacking:
+        self.is_open = self._is_enabled and self._is_due
+        if self.is_open and not self.lacking:
             self.candidates.add(self)
         else:
             self.candidates.discard(self)

@@ -19,19 +19,22 @@ from neuros.project.model import Connection
 
 
 class Consumer(Protocol):
-    """A hook, for its inputs."""
+    """A hook, for its inputs.
+
+    Attributes:
+        lacking: the number of inputs that lack a packet.
+        is_open: whether the hook may start once none does.
+        candidates: the hooks of the node that may start.
+    """
 
     name: str
     missed_ticks: int
+    lacking: int
+    is_open: bool
+    candidates: set[Any]
 
     def is_ready(self) -> bool:
         """Whether the hook may start now."""
-
-    def on_input_complete(self) -> None:
-        """An input of the hook has all packets that it needs."""
-
-    def on_input_incomplete(self) -> None:
-        """An input of the hook lacks a packet."""
 
 
 class InputQueue:
@@ -158,9 +161,15 @@ class Subscription:
             self.acknowledge_consumed()
 
     def consume(self, queue: InputQueue, now_ns: int) -> Any:
-        """Remove, return and acknowledge the oldest packet of ``queue``: its hook starts on it."""
-        _, position, packet = queue.packets.popleft()
-        if not queue.packets:
+        """Remove, return and acknowledge the oldest packet of ``queue``: its hook starts on it.
+
+        ``None`` if there is none.
+        """
+        packets = queue.packets
+        if not packets:
+            return None
+        _, position, packet = packets.popleft()
+        if not packets:
             queue.hook_input.on_emptied()
         queue.position = queue.passed = position
         self.taken.append(position)
@@ -238,7 +247,7 @@ class HookInput:
 
     Attributes:
         missing: number of packets that the hook still needs here.
-        hook: is called when ``missing`` becomes 0, and when it no longer is.
+        hook: is told when ``missing`` becomes 0, and when it no longer is.
     """
 
     __slots__ = ("_filled", "hook", "is_all", "is_optional", "missing", "name", "queues", "rest")
@@ -261,7 +270,10 @@ class HookInput:
         if self.missing:
             self.missing -= 1
             if not self.missing:
-                self.hook.on_input_complete()
+                hook = self.hook
+                hook.lacking -= 1
+                if not hook.lacking and hook.is_open:
+                    hook.candidates.add(hook)
 
     def on_emptied(self) -> None:
         """A queue is empty."""
@@ -269,7 +281,8 @@ class HookInput:
         if not self.is_optional and (self.is_all or not self._filled):
             self.missing += 1
             if self.missing == 1:
-                self.hook.on_input_incomplete()
+                self.hook.lacking += 1
+                self.hook.candidates.discard(self.hook)
 
     def on_discarded(self) -> None:
         """The oldest packet of a queue was discarded, and further packets are there."""
@@ -310,9 +323,7 @@ class HookInput:
 
     def consume(self, now_ns: int) -> Any:
         """The argument for the hook, which starts."""
-        if not self.is_all:
-            queue = self.queues[0] if len(self.queues) == 1 else self.chosen()
-            if queue is None or not queue.packets:
-                return None
-            return queue.subscription.consume(queue, now_ns)
-        return [q.subscription.consume(q, now_ns) if q.packets else None for q in self.queues]
+        if self.is_all:
+            return [queue.subscription.consume(queue, now_ns) for queue in self.queues]
+        queue = self.queues[0] if len(self.queues) == 1 else self.chosen()
+        return None if queue is None else queue.subscription.consume(queue, now_ns)

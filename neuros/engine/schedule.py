@@ -76,7 +76,7 @@ class Schedule:
         waiting: Rest | None = None
         blocked: Rest | None = None
         for hook in self.order:
-            if not (hook.is_enabled and hook.is_due):
+            if not hook.is_open:
                 continue
             hook_input = hook.awaited_input()
             if hook_input is not None:
@@ -92,9 +92,10 @@ class Schedule:
         """As :meth:`rest`, for the engine's own thread, and faster: reads candidates first."""
         if not self.candidates:
             for hook in self.order:
-                hook_input = hook.awaited_input()
-                if hook_input is not None:
-                    return hook_input.rest
+                if hook.is_open:
+                    for hook_input in hook.inputs:
+                        if hook_input.missing:
+                            return hook_input.rest
             return IDLE
         for hook in self.candidates:
             if not hook.blocked or hook.can_send():
@@ -251,6 +252,7 @@ class Pause:
         still_ns: start and end of each time without a hook of a step, one after the other. The
             latency of a packet does not count these times. The packet log empties the array.
         last_still_ns: the last few of these times.
+        is_still: whether no hook starts before another step is granted, or the pause ends.
     """
 
     def __init__(self, lifecycle: Lifecycle, ticks: Sequence[Hook]) -> None:
@@ -264,7 +266,7 @@ class Pause:
         self._still_since_ns: int | None = None
         self.still_ns = array("q")
         self.last_still_ns: deque[tuple[int, int]] = deque(maxlen=_LAST_STILL)
-        self.is_on = False
+        self.is_on = self.is_still = False
 
     def begin(self, now_ns: int) -> None:
         """Pause, if it is not paused already; the steps that are left are revoked."""
@@ -277,12 +279,13 @@ class Pause:
         """Revoke the steps that are left."""
         self._granted = 0
         self._started.clear()
+        self.is_still = self._lifecycle.is_running and self._still_since_ns is not None
 
     def end(self, now_ns: int) -> None:
         """End the pause; for ticks, no time has passed."""
         if not self.is_on:
             return
-        self.is_on = False
+        self.is_on = self.is_still = False
         self._end_standstill(now_ns)
         if not self._lifecycle.is_running:
             return
@@ -300,6 +303,7 @@ class Pause:
             is_driven: whether some node of the project has driving hooks.
         """
         if self.is_on:
+            self.is_still = False
             self._granted += steps
             self._arrived = arrivals
             self._limits_all = not is_driven

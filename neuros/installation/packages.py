@@ -11,6 +11,7 @@ import ssl
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from neuros.distribution import python_command
@@ -104,19 +105,23 @@ def install(
     installer.log.write_text("", "utf-8")
     extensions = [root / "extensions" / f"neuros-{extra}" for extra in extras]
     sources = [str(root), *(str(folder) for folder in extensions if folder.is_dir())]
-    editable = [word for source in sources for word in ("--editable", source)]
+    # uv leaves what a file names alone where it is installed and its cache-keys have not changed;
+    # arguments it builds each time.
+    listed = folder / "neuros-sources.txt"
+    listed.write_text("".join(f"-e {Path(source).as_uri()}\n" for source in sources), "utf-8")
     names = f"[{','.join(extras)}]"
     is_without_index = bool(environ.get("PIP_NO_INDEX"))
     source = environ.get("PIP_FIND_LINKS", "a folder") if is_without_index else "PyPI"
     progress.step(f"installing neuros{names} from {source} (log: {installer.log})")
     is_locked = not newest and not is_without_index
-    calls = [["--editable", f"{root}{names}", *editable[2:], *(["--upgrade"] if newest else [])]]
+    whole = ["--editable", f"{root}{names}", "--requirement", str(listed)]
+    calls = [[*whole, *(["--upgrade"] if newest else [])]]
     if is_locked:
         # No build isolation: it would take a setuptools that no lock file names.
         calls = [
             _locked(root, "build"),
             ["--no-build-isolation", *_locked(root, "core", *extras)],
-            ["--no-build-isolation", "--no-deps", *editable],
+            ["--no-build-isolation", "--no-deps", "--requirement", str(listed)],
         ]
     try:
         installer.require_uv(_locked(root, "uv") if is_locked else [UV])
@@ -205,13 +210,7 @@ class Installer:
             InstallationFailed: if uv fails, or is not there and cannot be installed.
             OSError: if it cannot be started, or the log cannot be written.
         """
-        # uv reads none of pip's files and variables, so pip lists its settings for uv.
-        pip = python_command("pip", "config", "list", python=self.python)
-        listing = answer_of(pip, self.environ)
-        environ, unknown = uv_environment(listing.stdout if listing else "", self.environ)
-        if unknown:
-            names = ", ".join(unknown)
-            self.progress.step(f"uv has no setting like pip's {names}, and goes without")
+        environ = dict(self._settings)
         if "--require-hashes" in arguments:
             # Lock files name every version, and uv refuses a constraint without a hash.
             environ.pop("UV_CONSTRAINT", None)
@@ -220,6 +219,17 @@ class Installer:
         if environ.get("UV_NO_INDEX", "0").lower() not in ("0", "no", "off", "false"):
             command.append("--no-index")
         return self._run([*command, *arguments], environ)
+
+    @cached_property
+    def _settings(self) -> Mapping[str, str]:
+        """The environment of uv, which reads none of pip's files and variables: pip lists them."""
+        pip = python_command("pip", "config", "list", python=self.python)
+        listing = answer_of(pip, self.environ)
+        environ, unknown = uv_environment(listing.stdout if listing else "", self.environ)
+        if unknown:
+            names = ", ".join(unknown)
+            self.progress.step(f"uv has no setting like pip's {names}, and goes without")
+        return environ
 
     def _run(self, command: Sequence[str], environ: Mapping[str, str]) -> str:
         """Run pip or uv, show what it does, and return what it wrote."""

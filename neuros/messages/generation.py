@@ -1,8 +1,8 @@
 """Program that generates C and Python from message definitions, with rosidl's generators.
 
 The generators print to standard output, replace it, and keep state in modules. So they run in an
-isolated Python process, which reads an :class:`Order` from standard input. Each generator has its
-own folder, since their files collide.
+isolated Python process, which reads an :class:`Order` as JSON from standard input. Each generator
+has its own folder, since their files collide.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 INTERFACES = "rosidl_adapter"
 DESCRIPTIONS = "rosidl_generator_type_description"
@@ -20,8 +20,7 @@ TYPE_SUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspect
 """Type supports that the middleware needs; it makes its type object from the second one."""
 
 
-@dataclass(frozen=True)
-class Order:
+class Order(NamedTuple):
     """A package to generate code for.
 
     Attributes:
@@ -40,9 +39,34 @@ class Order:
     prefix: str
     shares: dict[str, str]
 
-    def text(self) -> str:
-        """JSON for standard input."""
-        return json.dumps(asdict(self))
+    def arguments(self, generator: str, **more: Any) -> AbstractContextManager[str]:
+        """A file with the arguments of a generator, ``more`` of its own among them.
+
+        Makes the folders and headers that the generator expects.
+        """
+        from rosidl_cli.command import helpers
+
+        output = generated(Path(self.output), generator, self.package)
+        for file in self.files:
+            (output / Path(file).parent / "detail").mkdir(parents=True, exist_ok=True)
+        templates = Path(self.prefix, "share", generator, "resource")
+        for template in templates.glob("*__visibility_control.h.in"):
+            # All headers of a package include the one in ``msg``.
+            helpers.generate_visibility_control_file(
+                package_name=self.package,
+                template_path=template,
+                output_path=output / "msg" / template.stem,
+            )
+        idl = generated(Path(self.output), INTERFACES, self.package)
+        common = helpers.legacy_generator_arguments(
+            package_name=self.package,
+            interface_files=[f"{idl}:{Path(file).with_suffix('.idl')}" for file in self.files],
+            include_paths=[],
+            templates_path=templates,
+            output_path=output,
+        )
+        arguments: AbstractContextManager[str] = helpers.generator_arguments_file(**common, **more)
+        return arguments
 
 
 def generated(output: Path, generator: str, package: str) -> Path:
@@ -50,20 +74,17 @@ def generated(output: Path, generator: str, package: str) -> Path:
     return output / generator / package
 
 
-def describe(order: Order) -> Arguments:
+def describe(order: Order) -> None:
     """Translate definitions to IDL, and write descriptions and hashes of types (REP 2011)."""
     from rosidl_adapter import convert_to_idl
     from rosidl_generator_type_description import generate_type_hash
 
-    folder, idl = Path(order.folder), generated(Path(order.output), INTERFACES, order.package)
-    files = [
-        convert_to_idl(folder, order.package, Path(file), idl).relative_to(idl)
-        for file in order.files
-    ]
-    arguments = Arguments(order, files)
+    idl = generated(Path(order.output), INTERFACES, order.package)
+    for file in order.files:
+        convert_to_idl(Path(order.folder), order.package, Path(file), idl)
     shares = [f"{name}:{share}" for name, share in order.shares.items()]
-    generate_type_hash(arguments.file(DESCRIPTIONS, include_paths=shares))
-    return arguments
+    with order.arguments(DESCRIPTIONS, include_paths=shares) as file:
+        generate_type_hash(file)
 
 
 def generate(order: Order) -> None:
@@ -74,62 +95,24 @@ def generate(order: Order) -> None:
     from rosidl_typesupport_fastrtps_c import generate_typesupport_fastrtps_c
     from rosidl_typesupport_introspection_c import generate_c as generate_introspection
 
-    arguments = describe(order)
+    describe(order)
     descriptions = generated(Path(order.output), DESCRIPTIONS, order.package)
-    generate_c(
-        arguments.file(
-            "rosidl_generator_c",
-            type_description_tuples=[
-                f"{file}:{(descriptions / file).with_suffix('.json')}" for file in arguments.idl
-            ],
-            ros_interface_files=[str(Path(order.folder, file)) for file in order.files],
-        )
-    )
-    generate_introspection(arguments.file("rosidl_typesupport_introspection_c"))
-    generate_typesupport_fastrtps_c(arguments.file("rosidl_typesupport_fastrtps_c"))
-    generate_dispatch(arguments.file("rosidl_typesupport_c"), list(TYPE_SUPPORTS))
-    generate_py(arguments.file("rosidl_generator_py"), ["rosidl_typesupport_c"])
-
-
-class Arguments:
-    """Files with the arguments of generators, and other files and folders that these expect.
-
-    Attributes:
-        idl: the IDL files, relative to their folder.
-    """
-
-    def __init__(self, order: Order, idl: Sequence[Path]) -> None:
-        self._order, self.idl = order, tuple(idl)
-
-    def file(self, generator: str, **more: Any) -> str:
-        """Write the arguments of a generator, ``more`` of its own among them; returns the path."""
-        from rosidl_cli.command.helpers import generate_visibility_control_file
-
-        order = self._order
-        output = generated(Path(order.output), generator, order.package)
-        idl = generated(Path(order.output), INTERFACES, order.package)
-        for interface in order.files:
-            (output / Path(interface).parent / "detail").mkdir(parents=True, exist_ok=True)
-        templates = Path(order.prefix, "share", generator, "resource")
-        for template in templates.glob("*__visibility_control.h.in"):
-            # All headers of a package include the one in ``msg``.
-            generate_visibility_control_file(
-                package_name=order.package,
-                template_path=template,
-                output_path=output / "msg" / template.stem,
-            )
-        content = {
-            "package_name": order.package,
-            "output_dir": str(output),
-            "template_dir": str(templates),
-            "idl_tuples": [f"{idl}:{file}" for file in self.idl],
-            "target_dependencies": [],
-            **more,
-        }
-        file = Path(order.output, f"{generator}.json")
-        file.write_text(json.dumps(content), "utf-8")
-        return str(file)
+    idl = [Path(file).with_suffix(".idl") for file in order.files]
+    with order.arguments(
+        "rosidl_generator_c",
+        type_description_tuples=[f"{f}:{(descriptions / f).with_suffix('.json')}" for f in idl],
+        ros_interface_files=[str(Path(order.folder, file)) for file in order.files],
+    ) as file:
+        generate_c(file)
+    for name, run, *more in (
+        ("rosidl_typesupport_introspection_c", generate_introspection),
+        ("rosidl_typesupport_fastrtps_c", generate_typesupport_fastrtps_c),
+        ("rosidl_typesupport_c", generate_dispatch, list(TYPE_SUPPORTS)),
+        ("rosidl_generator_py", generate_py, ["rosidl_typesupport_c"]),
+    ):
+        with order.arguments(name) as file:
+            run(file, *more)
 
 
 if __name__ == "__main__":
-    generate(Order(**json.load(sys.stdin)))
+    generate(Order(*json.load(sys.stdin)))

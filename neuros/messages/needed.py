@@ -16,12 +16,13 @@ from graphlib import CycleError
 from importlib.util import find_spec
 from pathlib import Path
 
+from neuros.caching import sweep
 from neuros.errors import EnvironmentFault, Problem
 from neuros.installation.machine import system_install
 from neuros.installation.progress import Progress
 from neuros.messages import generation
 from neuros.messages.package import MANIFEST, Package
-from neuros.messages.workspace import Built, Workspaces, cycle_problem, sweep
+from neuros.messages.workspace import Built, Workspaces, cycle_problem
 from neuros.project.model import Node
 
 # Packages that the generated code of services and actions needs, beside those in their files.
@@ -308,7 +309,7 @@ class _Builder:
         # By its path and isolated: it needs nothing of NeuROS, and nothing that PYTHONPATH names.
         # Generators open some files in the encoding of the locale, which may not be UTF-8.
         command = [sys.executable, "-I", "-X", "utf8", generation.__file__]
-        self._run(command, order.text())
+        self._run(command, json.dumps(order))
 
     def _compile(self) -> None:
         """Make the libraries of the package, and its module for Python."""

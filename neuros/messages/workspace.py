@@ -21,15 +21,13 @@ import contextlib
 import hashlib
 import os
 import platform
-import shutil
-import time
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
-from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
+from neuros.caching import KEY_LENGTH, Kept, cache_root
 from neuros.errors import Problem
 from neuros.messages.package import (
     MANIFEST,
@@ -236,11 +234,6 @@ class Built(Kept):
         return self.folder / "share" / self.package
 
     @property
-    def draft(self) -> Path:
-        """The folder in which it is built."""
-        return self.beside(".draft")
-
-    @property
     def is_there(self) -> bool:
         return self.folder.is_dir()
 
@@ -248,17 +241,3 @@ class Built(Kept):
         """Keep the build from being removed as unused."""
         with contextlib.suppress(OSError):
             os.utime(self.folder)
-
-
-def sweep(cache: Path) -> None:
-    """Remove interrupted builds, and builds and logs that are unused for a month."""
-    oldest_s = time.time() - UNUSED_S
-    for built in map(Built, kept_in(cache)):
-        with contextlib.suppress(OSError), built.locked(wait=False) as is_mine:
-            if is_mine:
-                shutil.rmtree(built.draft, ignore_errors=True)
-                if built.is_there and built.folder.stat().st_mtime < oldest_s:
-                    built.folder.rename(built.draft)  # half of a folder must not count as built
-                    shutil.rmtree(built.draft, ignore_errors=True)
-                if built.log.exists() and built.log.stat().st_mtime < oldest_s:
-                    built.log.unlink()

@@ -68,13 +68,16 @@ class NodeRuntime:
 
     Attributes:
         histories: the newest packets, where they are kept.
-        engine: ``None`` until :meth:`load`.
+        engine: ``None`` until :meth:`load`; ``loaded``: the same, from then on.
+        time: its simulated time.
         specs: the hooks of its plugin, once that is loaded; after a reset, those that hold then.
         handle: the ``node`` that hooks receive.
         keeping: what its plugin keeps.
         failures: reports its errors.
         reports: what it says of itself.
     """
+
+    loaded: Engine
 
     def __init__(
         self,
@@ -122,7 +125,7 @@ class NodeRuntime:
         self._guard = self.failures.guard
         virtual = self._virtual
         wall_ns = time.time_ns if virtual is None else (lambda: max(0, clock() - virtual.zero_ns))
-        self._time = SimulatedTime(
+        self.time = SimulatedTime(
             *(file.node, duration_sim_s, clock, self._end_by_duration, wall_ns)
         )
         sampler = Sampler()
@@ -130,7 +133,7 @@ class NodeRuntime:
         self._services = PluginServices(
             middleware.packets,
             self._loop,
-            self._time,
+            self.time,
             self.failures,
             self._ask_for_end,
             lambda text: tell(Progress(self.name, text)),
@@ -141,14 +144,14 @@ class NodeRuntime:
         )
         if self._virtual is not None:
             self._services.virtual_time = VirtualTime(
-                self._virtual, lambda: self._loaded, self.failures
+                self._virtual, lambda: self.loaded, self.failures
             )
         self.handle = NodeHandle(file, ros_node, self._services)
         self._recorder: NodeRecorder | None = None
-        instruments: list[Instrument] = [self._time, sampler]
+        instruments: list[Instrument] = [self.time, sampler]
         if recorder is not None:
             self._recorder = NodeRecorder(
-                recorder, middleware.packets.encode, lambda: self._time.now_s, self._logger
+                recorder, middleware.packets.encode, lambda: self.time.now_s, self._logger
             )
             instruments.append(self._recorder)
         self._on_initialised = on_initialised
@@ -167,7 +170,7 @@ class NodeRuntime:
             self._transport,
             self.handle,
             self.failures,
-            self._time,
+            self.time,
             instruments,
             contexts=contexts,
             context=self._context,
@@ -176,7 +179,7 @@ class NodeRuntime:
         )
         world_log = None if recorder is None else WorldLog(self.run_dir, self._logger)
         self.reports = NodeReports(
-            *(file, middleware, self._transport, self._time, sampler, clock),
+            *(file, middleware, self._transport, self.time, sampler, clock),
             *(self._recorder, world_log, lambda: self.keeping.names),
         )
         node, passage = file.node, self._effects.passage
@@ -201,12 +204,12 @@ class NodeRuntime:
     @property
     def sim_time(self) -> float | None:
         """Simulated seconds, ``None`` where the node owns no time."""
-        return self._time.now_s
+        return self.time.now_s
 
     @property
     def is_paused(self) -> bool:
         """Whether its hooks stand still, but for steps."""
-        return self._loaded.is_paused
+        return self.loaded.is_paused
 
     @property
     def waiting_threads(self) -> set[threading.Thread]:
@@ -236,8 +239,8 @@ class NodeRuntime:
         """
         if not self._has_timer and any(spec.kind is HookKind.TICK for spec in self.specs):
             self._has_timer = True
-            self._loop.add_timer(lambda: self._loaded.next_due_ns, self.on_timer)
-        self._guard(partial(self._loaded.start, awaits_others=awaits_others))
+            self._loop.add_timer(lambda: self.loaded.next_due_ns, self.on_timer)
+        self._guard(partial(self.loaded.start, awaits_others=awaits_others))
         if not awaits_others:
             self._services.is_active.set()
 
@@ -251,7 +254,7 @@ class NodeRuntime:
     def _activate(self) -> None:
         if self._services.virtual_time is not None:
             self._services.virtual_time.activate()
-        self._guard(self._loaded.activate)
+        self._guard(self.loaded.activate)
         self._services.is_active.set()
 
     @property
@@ -281,7 +284,7 @@ class NodeRuntime:
             NodeError: if it cannot keep what it is to.
         """
         is_kept = bool(self._resets)
-        self._loaded.stop_hooks()
+        self.loaded.stop_hooks()
         self._enter()
         if not is_kept:
             self._finalise_hooks()
@@ -293,7 +296,7 @@ class NodeRuntime:
         forgets = not is_kept and not self.file.node.hooks
         self._contexts.renew(self._context, environment, forgets_modules=forgets)
         self._enter()
-        self._time.begin_anew(keeps_owner=is_kept)
+        self.time.begin_anew(keeps_owner=is_kept)
         self._services.results.clear()
         self.histories.by_output.clear()
         if is_kept:
@@ -348,7 +351,7 @@ class NodeRuntime:
             last_round: hooks that start at most once more; see :meth:`Engine.drain`.
             is_asked: whether a node has asked for this, at a time of the run's clock.
         """
-        drain = partial(self._guard, lambda: self._loaded.drain(last_round))
+        drain = partial(self._guard, lambda: self.loaded.drain(last_round))
         if self._virtual is None:
             drain()
         else:
@@ -356,18 +359,16 @@ class NodeRuntime:
 
     def pause(self) -> None:
         """Start no further hook until :meth:`resume`."""
-        self._loaded.pause()
+        self.loaded.pause()
 
     def resume(self) -> None:
         """Go on after a pause."""
-        self._guard(self._loaded.resume)
+        self._guard(self.loaded.resume)
 
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let each hook that drives the project start ``count`` times."""
-        engine = self.engine
-        assert engine is not None
         try:
-            engine.step(count, is_driven=is_driven)
+            self.loaded.step(count, is_driven=is_driven)
         except NeurosError as error:
             self.failures.report(error)
 
@@ -399,10 +400,8 @@ class NodeRuntime:
         if self._arrivals and (passage := self._arrivals.get(connection)) is not None:
             for observe in passage.observers:
                 observe(packet, None)
-        engine = self.engine
-        assert engine is not None
         try:
-            engine.on_packet(connection, packet)
+            self.loaded.on_packet(connection, packet)
         except NeurosError as error:
             self.failures.report(error)
 
@@ -410,7 +409,10 @@ class NodeRuntime:
         """A packet has arrived on an external topic."""
         for observe in self._heard[port.name].observers:
             observe(packet, None)
-        self._guard(partial(self._loaded.on_packet, port.name, packet))
+        try:
+            self.loaded.on_packet(port.name, packet)
+        except NeurosError as error:
+            self.failures.report(error)
 
     def deliver(self, input_name: str, data: bytes) -> None:
         """An observer sends a packet to an input of the session.
@@ -431,20 +433,18 @@ class NodeRuntime:
 
     def on_acknowledgement(self, connection: Connection, position: int) -> None:
         """The receiver of a connection has started on packets."""
-        engine = self.engine
-        assert engine is not None
         try:
-            engine.on_acknowledgement(connection, position)
+            self.loaded.on_acknowledgement(connection, position)
         except NeurosError as error:
             self.failures.report(error)
 
     def on_registered(self, connection: Connection) -> None:
         """The receiver of a connection is there."""
-        self._guard(lambda: self._loaded.on_registered(connection))
+        self._guard(lambda: self.loaded.on_registered(connection))
 
     def on_timer(self) -> None:
         """The next due time of a hook has come."""
-        self._guard(self._loaded.on_timer)
+        self._guard(self.loaded.on_timer)
 
     # ------------------------------------------------------------------ inside
 
@@ -486,12 +486,12 @@ class NodeRuntime:
             )
             for port in node.outputs
         }
-        self.engine = self._services.engine = self._make_engine(
+        self.loaded = self.engine = self._services.engine = self._make_engine(
             node, self.file.connections, self.specs, self._effects, self._clock, types
         )
         if self._is_held:
             self.engine.pause()
-        self._time.clock = self.engine.sim_clock
+        self.time.clock = self.engine.sim_clock
         self._uninitialised = sum(spec.kind is HookKind.INITIALISE for spec in self.specs)
         return self.engine
 
@@ -529,11 +529,6 @@ class NodeRuntime:
     @property
     def _resets(self) -> list[HookSpec]:
         return [spec for spec in self._plugin if spec.kind is HookKind.RESET]
-
-    @property
-    def _loaded(self) -> Engine:
-        assert self.engine is not None
-        return self.engine
 
     def _ask_for_end(self, reason: str, drain_s: float) -> None:
         virtual, request = self._virtual, Shutdown(self.name, reason, drain_s)
@@ -582,7 +577,7 @@ class NodeEffects:
         self._transport = transport
         self._handle = handle
         self._guard = failures.guard
-        self._time = time
+        self.time = time
         # Nothing is to be added to these: each call that is left out counts.
         self.acknowledger = transport.acknowledger
         self.has_taken_in = transport.has_taken_in
@@ -620,8 +615,8 @@ class NodeEffects:
         self._note_execution()
         if spec.kind is HookKind.INITIALISE:
             self._on_initialised()
-        if self._time.is_watched:
-            self._time.update()
+        if self.time.is_watched:
+            self.time.update()
         return result
 
     def finalise(self, spec: HookSpec) -> None:
@@ -692,7 +687,7 @@ class VirtualEffects(NodeEffects):
         """
         if self._durations is None:
             loop = cast(NodeLoop, self._loop)
-            self._durations = Durations(self._file, loop, lambda: self._time.now_s)
+            self._durations = Durations(self._file, loop, lambda: self.time.now_s)
             if self._handle.virtual_time is not None:
                 self._handle.virtual_time.durations = self._durations
             self._note_execution = self._hold

@@ -30,6 +30,7 @@ class SimulatedTime:
         is_watched: whether the node owns time, so that :meth:`look` is wanted after each hook.
         expected_end_s: when the plugin says that it will end the project, ``None``: not known.
         clock: that of the node's engine, which tells the time of other nodes.
+        read_s: reads the simulated seconds of what the node owns, ``None`` where they are unknown.
     """
 
     def __init__(
@@ -49,20 +50,20 @@ class SimulatedTime:
         self._wall_ns = wall_ns
         self._on_over = on_over
         self._timeline = Timeline()
-        self._read_s: Callable[[], float] | None = None
+        self.read_s: Callable[[], float] | None = None
         self._has_clock = node.clock is not None
         self.clock = SimClock()
 
     @property
     def now_s(self) -> float | None:
         """Simulated seconds of what the node owns, ``None`` where they are unknown."""
-        return None if self._read_s is None else self._read_s()
+        return None if self.read_s is None else self.read_s()
 
     @property
     def known_s(self) -> float | None:
         """Simulated seconds as far as the node knows: of what it owns, or else of its clock."""
-        if self._read_s is not None:
-            return self._read_s()
+        if self.read_s is not None:
+            return self.read_s()
         return None if self.clock.now_ns is None else self.clock.now_ns / 1e9
 
     def stamp(self, reading: Callable[[int], int]) -> Any:
@@ -71,8 +72,8 @@ class SimulatedTime:
         Args:
             reading: what is read of the wall clock, by what it says (:meth:`Engine.reading`).
         """
-        if self._read_s is not None:
-            return to_stamp(self._read_s())
+        if self.read_s is not None:
+            return to_stamp(self.read_s())
         if self._has_clock or self.is_watched:
             return to_stamp(nanoseconds=self.clock.now_ns or 0)
         return to_stamp(nanoseconds=reading(self._wall_ns()))
@@ -80,13 +81,13 @@ class SimulatedTime:
     def begin_anew(self, *, keeps_owner: bool) -> None:
         """The node was reset; ``keeps_owner``: the simulator that has the time goes on."""
         if not (keeps_owner and self._is_owned):
-            self._read_s, self._is_owned = None, False
+            self.read_s, self._is_owned = None, False
         self.expected_end_s = None
         self._timeline = Timeline()
 
     def own(self, read_s: Callable[[], float]) -> None:
         """Read the time from a simulator, not from a clock that the node publishes."""
-        self._read_s = read_s
+        self.read_s = read_s
         self._is_owned = True
 
     def attach(self, passage: Passage) -> None:
@@ -98,7 +99,7 @@ class SimulatedTime:
         if self._is_owned:
             return
         seconds = to_seconds(packet)
-        self._read_s = lambda: seconds
+        self.read_s = lambda: seconds
         if self.is_watched:
             self.update()
 
@@ -111,9 +112,9 @@ class SimulatedTime:
 
     def update(self) -> None:
         """It may have gone on; it may be over."""
-        if self._read_s is None:
+        if self.read_s is None:
             return
-        time_s = self._read_s()
+        time_s = self.read_s()
         self._timeline.add(time_s, self._clock() / 1e9)
         if self._duration_s is not None and self.is_over and not self._has_told:
             self._has_told = True

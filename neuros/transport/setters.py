@@ -43,17 +43,21 @@ def guard_setters(kind: Any) -> None:
             convert = _refusing(name, _to_array(field) if is_array else _to_sequence(field))
             generated = getattr(kind, name)
             get = _view_of(field) if is_array else generated.fget
-            setattr(kind, name, property(get, _setter(field.slot, convert, generated.fset)))
+            setattr(kind, name, property(get, _setter(field, convert, generated.fset)))
             if not is_array:
                 sequences[name] = convert
     if sequences:
         _guard_constructor(kind, sequences)
 
 
-def _setter(slot: str, convert: Convert, generated: _Put) -> _Put:
+def _setter(field: Field, convert: Convert, generated: _Put) -> _Put:
+    slot, code = field.slot, field.type.code if field.shape is Shape.BUFFER else ""
+
     def put(message: Any, value: Any) -> None:
         if message._check_fields:  # ROS_PYTHON_CHECK_FIELDS: ROS refuses more
             generated(message, value)
+        elif type(value) is array and value.typecode == code:
+            setattr(message, slot, value[:])
         else:
             setattr(message, slot, convert(value))
 
@@ -91,8 +95,7 @@ def _to_sequence(field: Field) -> Convert:
     code, convert_other = field.type.code, converter(field)
 
     def convert(value: Any) -> Any:
-        is_same = type(value) is array and value.typecode == code
-        if is_same or isinstance(value, _MEMORY):
+        if (type(value) is array and value.typecode == code) or isinstance(value, _MEMORY):
             return array(code, value)
         if isinstance(value, Iterable) and not (
             isinstance(value, str) or hasattr(type(value), "__array__")

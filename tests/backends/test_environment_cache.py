@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from neuros.backends.virtual_environments import CachedEnvironment, cache_folder, sweep
+from neuros.backends.virtual_environments import CachedEnvironment, cache_folder
+from neuros.caching import sweep
 
 MONTHS_AGO_S = time.time() - 90 * 24 * 3600
 KEY = "0123456789ab"
@@ -85,11 +86,11 @@ def test_what_was_interrupted_and_what_nobody_uses_is_swept(tmp_path: Path) -> N
         make(each)
     for each in (used, unused):
         each.record_use()
-        os.utime(each.stamp, (MONTHS_AGO_S, MONTHS_AGO_S))
+        os.utime(each.mark, (MONTHS_AGO_S, MONTHS_AGO_S))
     used.record_use()
     (tmp_path / "of-somebody-else").mkdir()
     with working.locked():
-        sweep(tmp_path)
+        sweep(tmp_path, CachedEnvironment)
         assert working.folder.is_dir()
     assert {path.name for path in tmp_path.iterdir()} == {
         f"used-{KEY}",
@@ -101,8 +102,8 @@ def test_what_was_interrupted_and_what_nobody_uses_is_swept(tmp_path: Path) -> N
 def test_the_log_of_what_failed_stays_for_a_month(entry: CachedEnvironment) -> None:
     entry.folder.parent.mkdir()
     entry.log.write_text("ERROR: no")
-    sweep(entry.folder.parent)
+    sweep(entry.folder.parent, CachedEnvironment)
     assert entry.log.exists()
     os.utime(entry.log, (MONTHS_AGO_S, MONTHS_AGO_S))
-    sweep(entry.folder.parent)
+    sweep(entry.folder.parent, CachedEnvironment)
     assert not list(entry.folder.parent.iterdir())

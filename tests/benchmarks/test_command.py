@@ -12,8 +12,9 @@ from benchmarks import dora, page, subjects
 from benchmarks.measure import Case, Figure, Group, Subject, Unavailable
 from benchmarks.results import Results
 from benchmarks.targets import BOUNDS, TARGETS
-from neuros.cli import setup
+from neuros.cli import machine
 from neuros.cli.main import main
+from neuros.errors import UsageError
 
 
 @pytest.fixture
@@ -30,7 +31,7 @@ def cheap(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         return {name: whole[name] for name in chosen or whole}
 
     monkeypatch.setattr(subjects, "load", load)
-    monkeypatch.setattr("benchmarks.running.load_before", lambda: 0.0)
+    monkeypatch.setattr("benchmarks.running.load_before", lambda _: 0.0)
     return tmp_path / "results.json"
 
 
@@ -54,16 +55,11 @@ def test_a_measurement_that_fails_is_exit_code_1(
     assert "round trip" in output
 
 
-def test_results_are_shown_and_compared_without_measuring(
+def test_results_are_shown_without_measuring(
     cheap: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     main(["benchmark", "good", "--rounds", "6", "-o", str(cheap)])
-    cheap.with_name("b.json").write_text(cheap.read_text())
     capsys.readouterr()
-
-    assert main(["benchmark", "--compare", str(cheap), str(cheap.with_name("b.json"))]) == 0
-    assert re.search(r"^round trip +value .* 1 \(1 to 1\) +~$", capsys.readouterr().out, re.M)
-
     assert main(["benchmark", "--from", str(cheap)]) == 0
     assert "round trip" in capsys.readouterr().out
 
@@ -72,12 +68,23 @@ def test_the_numbers_page_keeps_what_people_wrote(cheap: Path, tmp_path: Path) -
     main(["benchmark", "good", "--rounds", "6", "-o", str(cheap)])
     file = tmp_path / "numbers.md"
     file.write_text(f"# Numbers\n\n{page.BEGIN}\nold\n{page.END}\n\nWhy.\n")
+    results = Results.read(cheap)
+    results.versions["commit"] = "0123abc"
     for _ in range(2):  # the second time changes nothing
-        page.write(Results.read(cheap), tmp_path)
+        page.write(results, tmp_path)
         text = file.read_text()
         assert text.startswith(f"# Numbers\n\n{page.BEGIN}\n\n### Targets\n")
         assert text.endswith(f"{page.END}\n\nWhy.\n")
         assert "old" not in text
+        assert re.search(r"`neuros benchmark good` \(20.+ cores of .+, 0123abc\)", text)
+
+
+def test_the_numbers_page_has_figures_of_commits_only(cheap: Path, tmp_path: Path) -> None:
+    main(["benchmark", "good", "--rounds", "6", "-o", str(cheap)])
+    results = Results.read(cheap)
+    results.versions["commit"] = "0123abc+"
+    with pytest.raises(UsageError, match="commit first"):
+        page.write(results, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -85,9 +92,8 @@ def test_the_numbers_page_keeps_what_people_wrote(cheap: Path, tmp_path: Path) -
     [
         (["nothing"], "no such subject: nothing (there are "),
         (["engine", "-k", "no such row"], "-k no such row: no row of engine"),
-        (["engine", "--list"], "--from, --compare and --list measure nothing"),
+        (["engine", "--list"], "--from and --list measure nothing"),
         (["--from", "missing.json"], "missing.json: No such file"),
-        (["--compare", "missing.json", "missing.json"], "missing.json: No such file"),
     ],
 )
 def test_wrong_usage_is_one_sentence(
@@ -100,7 +106,7 @@ def test_wrong_usage_is_one_sentence(
 def test_without_a_source_checkout_it_says_what_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(setup, "ROOT", tmp_path)
+    monkeypatch.setattr(machine, "ROOT", tmp_path)
     assert main(["benchmark", "engine"]) == 4
     assert f"no benchmarks in {tmp_path}: they are part of the source" in capsys.readouterr().err
 

@@ -64,7 +64,7 @@ def versus(name: str, candidate: str, reference: str) -> Case:
 
 @pytest.fixture(autouse=True)
 def _no_waiting(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("benchmarks.running.load_before", lambda: 0.0)
+    monkeypatch.setattr("benchmarks.running.load_before", lambda _: 0.0)
 
 
 def test_every_other_round_runs_the_other_way_round() -> None:

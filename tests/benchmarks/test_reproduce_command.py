@@ -14,7 +14,7 @@ from benchmarks.reproduce.experiment import Entry, Experiment
 from benchmarks.reproduce.kinds import Kind, Reading, Readings
 from benchmarks.reproduce.page import Section
 from benchmarks.reproduce.tables import Layout, Ours
-from neuros.cli import setup
+from neuros.cli import machine
 from neuros.cli.main import main
 
 PARTS = {"good": "Good", "bad": "Bad", "interrupted": "Interrupted"}
@@ -217,6 +217,6 @@ def test_another_folder_is_refused(
 def test_without_a_source_checkout_it_says_what_is_missing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(setup, "ROOT", tmp_path)
+    monkeypatch.setattr(machine, "ROOT", tmp_path)
     assert main(["reproduce", "tick"]) == 4
     assert f"no benchmarks in {tmp_path}: they are part of the source" in capsys.readouterr().err

@@ -1,5 +1,5 @@
 """Fuzzing: whatever a file or another program says, the answer is a sentence.
 
 ``targets`` says what is fed with what, ``mutation`` how inputs are changed, ``running`` what is
-allowed. ``test_fuzz`` tries some hundreds; ``python -m tests.fuzz`` goes on as long as it is told.
+allowed. ``test_fuzz`` tries some hundreds, and with ``--hypothesis-profile=long`` many thousands.
 """

@@ -27,13 +27,21 @@ def test_any_other_is_answered(name: str) -> None:
     target = TARGETS[name]
     seeds = target.seeds()
 
-    @settings(max_examples=20)
+    @settings(max_examples=settings().max_examples // 10)
     @given(st.randoms(use_true_random=False))
     def check(chance: random.Random) -> None:
         data = changed(seeds, target.mutate, chance)
         assert not fault_of(target, data, measures_memory=True), data
 
     check()
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("name", [name for name, target in TARGETS.items() if target.is_json])
+def test_every_value_of_json_in_turn_may_be_any_other(name: str) -> None:
+    for seed in TARGETS[name].seeds():
+        for data in each_change_of_json(seed):
+            assert not fault_of(TARGETS[name], data), data
 
 
 def test_each_value_of_json_is_changed_in_turn_and_only_one_at_a_time() -> None:

@@ -11,12 +11,13 @@ from pathlib import Path
 import pytest
 from message_packages import write_package
 
+from neuros.caching import sweep
 from neuros.errors import EnvironmentFault
 from neuros.installation.progress import Progress
 from neuros.messages import needed
 from neuros.messages.needed import Compilers, Messages
 from neuros.messages.package import find_packages
-from neuros.messages.workspace import Built, Workspaces, message_cache, sweep
+from neuros.messages.workspace import Built, Workspaces, message_cache
 from neuros.project.message_types import unknown_type
 from neuros.project.model import Node, Port
 

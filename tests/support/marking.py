@@ -85,7 +85,7 @@ BY_NAME = {
         "backends/test_placement.py",
         "backends/test_reaper.py",
         "backends/test_shared_memory.py::test_the_reaper",
-        "benchmarks/test_against.py::test_a_commit_that_is_none",
+        "benchmarks/test_against.py",
         "benchmarks/test_command.py",
         "benchmarks/test_reproduce_command.py",
         "cli/test_command_line.py::test_what_could_not_be_started",

@@ -37,11 +37,10 @@ from neuros.ports import NodeProgram
 from neuros.project.split import node_file_text, node_files_from_json
 from neuros.stacks import ProcessThreads
 from neuros.transport.dds_profile import as_asked
-from neuros_cluster.files import RECEIVED, RUNS, Follower, TreeStore, tree_cache
+from neuros_cluster.files import RECEIVED, RUNS, Follower, TreeStore, tree_cache, write_chunk
 from neuros_cluster.messages import (
     TO_AGENT,
     Chunk,
-    Content,
     Examine,
     Examined,
     Finish,
@@ -57,6 +56,7 @@ from neuros_cluster.messages import (
     Ready,
     Refused,
     Remark,
+    Sent,
     Start,
     Started,
     ThreadsRead,
@@ -100,7 +100,6 @@ class Agent:
         self._cache = tree_cache(os.environ)
         self._store = TreeStore(self._cache)
         self._trees: tuple[Tree, ...] = ()
-        self._awaited: set[str] = set()
         self._run: Path | None = None
         self._pythons = Pythons({})
         self._reaper: Reaper | None = None
@@ -164,8 +163,10 @@ class Agent:
                 case Place():
                     self._pump.timeout_s = message.timeout_s
                     self._begin_to_place(message)
-                case Content():
-                    self._receive(message)
+                case Chunk():
+                    write_chunk(self._store.received, message)
+                case Sent():
+                    self._place()
                 case Prepare(nodes):
                     self._prepare(nodes)
                 case Start():
@@ -194,19 +195,8 @@ class Agent:
         self._cache.mkdir(parents=True, exist_ok=True)
         self._store.clean_up()
         remove_old_runs(self._cache)
-        self._trees = (message.project, message.workspace)
-        lacking = self._store.lacking(self._trees)
-        self._awaited = set(lacking)
-        self._pump.send(Lacking(lacking))
-        if not lacking:
-            self._place()
-
-    def _receive(self, content: Content) -> None:
-        self._store.receive(content.digest, content.data)
-        if content.is_last:
-            self._awaited.discard(content.digest)
-            if not self._awaited:
-                self._place()
+        self._trees = message.trees
+        self._pump.send(Lacking(tuple(map(self._store.lacking, self._trees))))
 
     def _place(self) -> None:
         project, workspace = map(self._store.place, self._trees)

@@ -10,6 +10,7 @@ import contextlib
 import os
 import shlex
 import subprocess
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -30,12 +31,12 @@ from neuros.ports import ControlStream
 from neuros.project.model import Folders
 from neuros.stacks import ProcessThreads
 from neuros_cluster.deployment_file import Host
-from neuros_cluster.files import scan, write_chunk
+from neuros_cluster.files import chunks_of, scan, write_chunk
 from neuros_cluster.pump import Pump
 
 _SSH = ("-T", "-o", "BatchMode=yes", "-o", "ConnectTimeout=10")
 _CONNECT_S = 60.0
-_CONTENT_BYTES = 1 << 18
+_WORKSPACE = "workspace"
 _MOST_UNSENT_BYTES = 1 << 20
 _POLL_S = 0.05
 _COMMAND_NOT_FOUND = 127
@@ -80,12 +81,13 @@ class Machine:
         self._is_closed = False
         self._answers: list[Message] = []
         self._arrived = threading.Condition()
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the connection
         try:
             self._process = subprocess.Popen(
                 command,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
+                stderr=self._errors,
                 env=without_mark(os.environ),
                 start_new_session=True,
             )
@@ -93,7 +95,6 @@ class Machine:
             raise self._failed(f"{command[0]} cannot be started ({error.strerror})") from error
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._errors = _ErrorOutput(self._process)
         self._pump = Pump(
             os.dup(self._process.stdout.fileno()),
             os.dup(self._process.stdin.fileno()),
@@ -132,20 +133,18 @@ class Machine:
         Raises:
             EnvironmentFault: that is impossible.
         """
-        trees = {"project": (scan(project.name or "project", project), project)}
-        trees["workspace"] = (scan("workspace", WORKSPACE), WORKSPACE)
-        self._pump.send(agent.Place(trees["project"][0], trees["workspace"][0], self._timeout_s))
-        lacking = self._await(agent.Lacking).digests
-        paths = {
-            file.digest: folder / file.path
-            for tree, folder in trees.values()
-            for file in tree.files
-        }
-        for digest in lacking:
-            self._send_content(digest, paths[digest])
+        name = project.name if project.name != _WORKSPACE else ""
+        folders = {name or "project": project, _WORKSPACE: WORKSPACE}
+        trees = tuple(scan(name, folder) for name, folder in folders.items())
+        self._pump.send(agent.Place(trees, self._timeout_s))
+        lacking = self._await(agent.Lacking).paths
+        for (name, folder), paths in zip(folders.items(), lacking, strict=True):
+            for path in paths:
+                self._send_file(folder / path, f"{name}/{path}")
+        self._pump.send(agent.Sent())
         placed = self._await(agent.Placed)
         self.folders = Folders(Path(placed.project), Path(placed.workspace), Path(placed.run))
-        return len(lacking)
+        return sum(map(len, lacking))
 
     def prepare(self, nodes: Sequence[Mapping[str, object]]) -> tuple[Path, ...]:
         """Make environments and message packages there; returns the packages' folders.
@@ -234,7 +233,7 @@ class Machine:
         if self._process.poll() is None:
             self._process.kill()
             self._process.wait()
-        self._errors.join(_ENDS_S)
+        self._errors.close()
 
     # ------------------------------------------------------------------ inside
 
@@ -274,8 +273,10 @@ class Machine:
             code = self._process.wait(_EXITS_S)
         if code is None:
             self._process.kill()  # ssh would retry for minutes
-        self._errors.join(_EXITS_S)
-        said = self._errors.last
+        errors = self._errors.fileno()
+        end = os.pread(errors, _LAST_BYTES, max(0, os.fstat(errors).st_size - _LAST_BYTES))
+        lines = end.decode("utf-8", "replace").strip().splitlines()
+        said = lines[-1].strip() if lines else ""  # the last line: the reason of the program's end
         if code == _COMMAND_NOT_FOUND and not self.host.docker:
             said += f": name the command neuros there in /hosts/{self.host.name}/neuros"
         with self._arrived:
@@ -317,20 +318,14 @@ class Machine:
     def _failed(self, text: str) -> EnvironmentFault:
         return EnvironmentFault("\n".join(f"{self.host}: {line}" for line in text.splitlines()))
 
-    def _send_content(self, digest: str, path: Path) -> None:
+    def _send_file(self, path: Path, name: str) -> None:
         try:
-            with open(path, "rb") as file:
-                data = file.read(_CONTENT_BYTES)
-                while True:
-                    following = file.read(_CONTENT_BYTES)
-                    while self._pump.unsent_bytes > _MOST_UNSENT_BYTES:
-                        self._require_open()  # after Ctrl+C the pump has stopped writing
-                        time.sleep(_POLL_S)
-                    self._require_open()
-                    self._pump.send(agent.Content(digest, data, not following))
-                    if not following:
-                        return
-                    data = following
+            for chunk in chunks_of(path, name):
+                while self._pump.unsent_bytes > _MOST_UNSENT_BYTES:
+                    self._require_open()  # after Ctrl+C the pump has stopped writing
+                    time.sleep(_POLL_S)
+                self._require_open()
+                self._pump.send(chunk)
         except OSError as error:
             raise EnvironmentFault(f"{path} cannot be read: {error.strerror}") from error
 
@@ -348,28 +343,6 @@ def agent_command(host: Host) -> list[str]:
 def ssh_command(host: Host) -> list[str]:
     """``ssh`` with the options for a machine, without its destination."""
     return ["ssh", *_SSH, *host.ssh_options]
-
-
-class _ErrorOutput(threading.Thread):
-    """Reads the standard error of a program, and keeps its end."""
-
-    def __init__(self, process: subprocess.Popen[bytes]) -> None:
-        super().__init__(name="neuros-errors", daemon=True)
-        self._process = process
-        self._said = b""
-        self.start()
-
-    def run(self) -> None:
-        assert self._process.stderr is not None
-        with self._process.stderr as stream:
-            while data := os.read(stream.fileno(), 1 << 12):
-                self._said = (self._said + data)[-_LAST_BYTES:]
-
-    @property
-    def last(self) -> str:
-        """The last line: the reason of the program's end."""
-        lines = self._said.decode("utf-8", "replace").strip().splitlines()
-        return lines[-1].strip() if lines else ""
 
 
 _MOST_DRIFT = 1e-4

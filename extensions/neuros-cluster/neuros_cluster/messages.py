@@ -51,39 +51,33 @@ class Closed(Message):
     link: int
 
 
+class Chunk(Message):
+    """Bytes of a file of a tree or of the run folder, which is cut off at ``offset`` before."""
+
+    path: str
+    offset: int
+    data: bytes
+
+
 # ---------------------------------------------------------------------- from the launcher
 
 
-class TreeFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file of a tree: its path in there, the SHA-256 of its content, its length."""
-
-    path: str
-    digest: str
-    size: int
-    is_executable: bool = False
-
-
 class Tree(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A folder with files, known by its content."""
+    """A folder, known by its content: the SHA-256 of each file, with ``+x`` for executables."""
 
     name: str
-    files: tuple[TreeFile, ...]
+    files: Mapping[str, str]
 
 
 class Place(Message):
     """Make these trees; a launcher that is silent for ``timeout_s`` seconds is gone."""
 
-    project: Tree
-    workspace: Tree
+    trees: tuple[Tree, ...]
     timeout_s: float
 
 
-class Content(Message):
-    """The next part of a lacking file."""
-
-    digest: str
-    data: bytes
-    is_last: bool
+class Sent(Message):
+    """All lacking files have been sent, as :class:`Chunk`."""
 
 
 class Prepare(Message):
@@ -165,9 +159,9 @@ class Ready(Message):
 
 
 class Lacking(Message):
-    """The content to send, by digest; may be empty."""
+    """The files to send, for each tree; may be empty."""
 
-    digests: tuple[str, ...]
+    paths: tuple[tuple[str, ...], ...]
 
 
 class Placed(Message):
@@ -215,14 +209,6 @@ class ThreadsRead(Message):
     read: ProcessThreads
 
 
-class Chunk(Message):
-    """Bytes of a file of the run folder; the file is cut off at ``offset`` before."""
-
-    path: str
-    offset: int
-    data: bytes
-
-
 class Examined(Message):
     """State, subject, text and remedy of each finding."""
 
@@ -236,13 +222,13 @@ class Finished(Message):
     problems: tuple[str, ...] = ()
 
 
-BOTH_WAYS: Sequence[type[Message]] = (Ping, Pong, Opened, Said, Closed)
+BOTH_WAYS: Sequence[type[Message]] = (Ping, Pong, Opened, Said, Closed, Chunk)
 TO_AGENT: Sequence[type[Message]] = (
     *BOTH_WAYS,
-    *(Place, Content, Prepare, Start, KillNode, ReadThreads, Took, Examine, Finish),
+    *(Place, Sent, Prepare, Start, KillNode, ReadThreads, Took, Examine, Finish),
 )
 FROM_AGENT: Sequence[type[Message]] = (
     *BOTH_WAYS,
-    *(Ready, Lacking, Placed, Remark, Prepared, Started, Refused, NodeEnded, Chunk, Examined),
+    *(Ready, Lacking, Placed, Remark, Prepared, Started, Refused, NodeEnded, Examined),
     *(ThreadsRead, Finished),
 )

@@ -1,15 +1,13 @@
 """Pump: carries messages and control connections between a launcher and an agent.
 
-One thread at each end waits for all of its descriptors at once, and for nothing else: so signs of
-life are sent and received whatever the process does. Any data is a sign of life.
+At each end one thread reads all descriptors, and another one writes and beats, and they do nothing
+else: so signs of life are sent and received whatever the process does. Any data is one.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import selectors
-import socket
 import threading
 import time
 from collections import deque
@@ -22,6 +20,7 @@ from neuros.ports import ControlListener, ControlStream
 from neuros_cluster.messages import Closed, Opened, Ping, Pong, Said
 
 BEAT_S = 1.0
+_TURN_S = 0.1  # after which what other threads have asked for is done
 _CLOSED = "the connection was closed"
 _READ_BYTES = 1 << 16
 _MOST_UNSENT_BYTES = 1 << 20
@@ -64,36 +63,29 @@ class Pump(threading.Thread):
         self._decoder = decoder_of(tuple(accepted))
         self._peer, self._handle_other, self._lose = peer, handle, lose
         self._connect, self._translate = connect, translate
-        self._lock = threading.Lock()
         self._unsent = bytearray()
+        self._more = threading.Condition()
         self._received = bytearray()
         self._last: deque[Message] = deque()
         self._links: dict[int, ControlLink] = {}
         self._count = 0
         self._listener: ControlListener | None = None
         self._is_ending = False
-        self._waker, self._woken = socket.socketpair()
+        self._writer = threading.Thread(target=self._write, name=f"{self.name}-write", daemon=True)
         self._selector = selectors.DefaultSelector()
-        self._writes: set[int] = set()
-        for descriptor in (read_from, write_to):
-            os.set_blocking(descriptor, False)
-        self._waker.setblocking(False)
-        self._woken.setblocking(False)
         self._selector.register(read_from, selectors.EVENT_READ)
-        self._selector.register(self._woken, selectors.EVENT_READ)
 
     # ------------------------------------------------------------------ called by others
 
     def send(self, message: Message) -> None:
         """Queue a message to be sent. Callable from any thread."""
-        with self._lock:
+        with self._more:
             self._unsent += encode(message)
-        self._wake()
+            self._more.notify()
 
     def send_last(self, message: Message) -> None:
         """Send a message after all present data of control connections. Any thread."""
         self._last.append(message)
-        self._wake()
 
     @property
     def unsent_bytes(self) -> int:
@@ -103,26 +95,23 @@ class Pump(threading.Thread):
     def listen(self, listener: ControlListener) -> None:
         """Accept control connections from now on. Callable from any thread."""
         self._listener = listener
-        self._wake()
+        self._selector.register(listener, selectors.EVENT_READ)
 
     def end(self) -> None:
         """Write all queued messages, and end. Callable from any thread."""
-        self._is_ending = True
-        self._wake()
+        with self._more:
+            self._is_ending = True
+            self._more.notify()
 
-    # ------------------------------------------------------------------ the thread
+    # ------------------------------------------------------------------ the threads
 
     def run(self) -> None:
         """Run until :meth:`end`, or until the other end is gone."""
         reason = ""
-        next_s = 0.0
+        self._writer.start()
         try:
-            while not reason and not (self._is_ending and not (self._unsent or self._last)):
-                now_s = time.monotonic()
-                if now_s >= next_s:
-                    next_s = now_s + BEAT_S
-                    self.send(Ping(now_s))
-                reason = self._turn(max(0.0, next_s - time.monotonic()))
+            while not reason and (not self._is_ending or self._writer.is_alive()):
+                reason = self._turn()
         except Exception as error:  # nothing else would report that the pump has stopped
             reason = f"{type(error).__name__}: {error}"
         finally:
@@ -130,21 +119,37 @@ class Pump(threading.Thread):
                 self._lose(reason)  # before control connections are seen to end
             for link in tuple(self._links):
                 self._hang_up(link)
+            self.end()
             self._selector.close()
-            self._waker.close()
-            self._woken.close()
-            for descriptor in {self._read_from, self._write_to}:
-                with contextlib.suppress(OSError):
-                    os.close(descriptor)
+            os.close(self._read_from)
 
-    def _turn(self, wait_s: float) -> str:
+    def _write(self) -> None:
+        next_s = 0.0
+        try:
+            while True:
+                with self._more:
+                    if not self._unsent and (self._last or not self._is_ending):
+                        self._more.wait(max(0.0, next_s - time.monotonic()))
+                    if (now_s := time.monotonic()) >= next_s:
+                        next_s = now_s + BEAT_S
+                        self._unsent += encode(Ping(now_s))
+                    data = bytes(self._unsent[:_READ_BYTES])
+                    if self._is_ending and not (data or self._last):
+                        return
+                written = os.write(self._write_to, data)
+                with self._more:
+                    del self._unsent[:written]
+        except OSError:  # the other end is gone; its last data is still to be read
+            self._unsent.clear()
+        finally:
+            os.close(self._write_to)
+
+    def _turn(self) -> str:
         """Handle what is ready; returns why the other end is gone, empty while it is there."""
-        self._watch()
-        ready = {key.fd for key, _ in self._selector.select(wait_s)}
-        if self._woken.fileno() in ready:
-            with contextlib.suppress(BlockingIOError):
-                while self._woken.recv(_READ_BYTES):
-                    pass
+        for number, link in tuple(self._links.items()):
+            if not link.flush() or len(link.unsent) > _MOST_UNSENT_BYTES:
+                self._part(number)
+        ready = {key.fd for key, _ in self._selector.select(_TURN_S)}
         if self._read_from in ready and (reason := self._read()):
             return reason
         if self._listener is not None and self._listener.fileno() in ready:
@@ -153,33 +158,15 @@ class Pump(threading.Thread):
             if link.fileno() in ready:
                 self._relay(number, link)
         self._send_last()
-        if self._write_to in ready and (reason := self._write()):
-            return reason
         silent_s = time.monotonic() - self.received_s
         # Not ready: all data that arrived while this process could not run has been read.
         if self.timeout_s is not None and not ready and silent_s > self.timeout_s:
             return f"nothing was heard of {self._peer} for {self.timeout_s:g} s"
         return ""
 
-    def _watch(self) -> None:
-        """Register what is to be written and accepted."""
-        wanted = {self._write_to} if self._unsent else set()
-        for descriptor in self._writes - wanted:
-            self._selector.unregister(descriptor)
-        for descriptor in wanted - self._writes:
-            self._selector.register(descriptor, selectors.EVENT_WRITE)
-        self._writes = wanted
-        if self._listener is not None and self._listener not in self._selector.get_map():
-            self._selector.register(self._listener, selectors.EVENT_READ)
-        for number, link in tuple(self._links.items()):
-            if not link.flush() or len(link.unsent) > _MOST_UNSENT_BYTES:
-                self._part(number)
-
     def _read(self) -> str:
         try:
             data = os.read(self._read_from, _READ_BYTES)
-        except BlockingIOError:
-            return ""
         except OSError as error:
             return str(error.strerror)
         if not data:
@@ -209,20 +196,6 @@ class Pump(threading.Thread):
                 for link in self._links.values():
                     link.flush()  # keeps the order of arrival
                 self._handle_other(message)
-
-    def _write(self) -> str:
-        with self._lock:
-            try:
-                written = os.write(self._write_to, self._unsent[:_READ_BYTES])
-            except BlockingIOError:
-                return ""
-            except BrokenPipeError:  # the other end is gone; its last data is still to be read
-                self._unsent.clear()
-                return ""
-            except OSError as error:
-                return str(error.strerror)
-            del self._unsent[:written]
-        return ""
 
     # ------------------------------------------------------------------ control connections
 
@@ -280,7 +253,3 @@ class Pump(threading.Thread):
             link.flush()
             self._selector.unregister(link)
             link.close()
-
-    def _wake(self) -> None:
-        with contextlib.suppress(OSError):
-            self._waker.send(b"\0")

@@ -261,18 +261,26 @@ class _World:
                 self.session.send(end, message)
 
     def _observe(self) -> Any:
-        packets = {name: output.shared_packet for name, output in self._outputs.items()}
-        found = {each.name: each.read(packets[each.port]) for each in self._observations}
-        return next(iter(found.values())) if self._has_one_observation else found
+        outputs = self._outputs
+        if self._has_one_observation:
+            each = self._observations[0]
+            return each.read(outputs[each.port].shared_packet)
+        packets = {name: output.shared_packet for name, output in outputs.items()}
+        return {each.name: each.read(packets[each.port]) for each in self._observations}
 
     def _seen(self, before: Any) -> dict[str, Any]:
         """What the user's functions are given, by :data:`_SEEN`."""
-        values = (self.observation, before, self.action, self.session, self)
-        return dict(zip(_SEEN, values, strict=True))
+        return {
+            "observation": self.observation,
+            "previous_observation": before,
+            "action": self.action,
+            "session": self.session,
+            "env": self,
+        }
 
     def _information(self, seen: Mapping[str, Any]) -> dict[str, Any]:
         sim_time, own = self.session.sim_time, self._functions["info"](seen)
-        if not isinstance(own, Mapping):
+        if own is not _NOTHING and not isinstance(own, Mapping):
             raise UsageError(f"info returned {own!r}, which is no mapping")
         return {**({} if sim_time is None else {"sim_time": sim_time}), **own}
 

@@ -9,14 +9,13 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, TimeoutError
-from contextlib import contextmanager, nullcontext
-from functools import partial
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from neuros.errors import ModelError
 from neuros.ports import NodeContext, Packet
-from neuros.simulators.mujoco.commands import Controls, control
+from neuros.simulators.mujoco.commands import Command, Controls, control
 from neuros.simulators.mujoco.lookup import did_you_mean
 from neuros.simulators.mujoco.scene import WorldView
 from neuros.simulators.mujoco.timing import FreeRun, StepLock
@@ -27,7 +26,6 @@ _BOUT_STEPS = 20
 _IDLE_S = 0.1
 _REFRESH_S = 1 / 60
 _SPACE = 32
-_ALONE = nullcontext()
 _CLOSE_S = 4.0  # shorter than a node's time to end; software OpenGL is slow to close
 
 
@@ -229,11 +227,11 @@ class MuJoCo:
             self._world.require_bound()
             hint = did_you_mean(input_name, self._world.commands)
             raise ModelError(f"no input '{input_name}' has an actuator{hint}")
-        self._set(partial(command, packet))
+        self._set(command, packet)
 
     def actuate(self, name: str, value: float) -> None:
         """Drive one actuator of the model, whether declared or not, from the next step on."""
-        self._set(lambda: control(self.model, name, value))
+        self._set(lambda _: control(self.model, name, value), None)
 
     def spawn_entity(self, path: str | Path, position: Sequence[float], name: str) -> None:
         """Attach the model of a file to the world at ``position`` (x, y, z in metres).
@@ -281,12 +279,17 @@ class MuJoCo:
 
     # ---- inside -----------------------------------------------------------------------------
 
-    def _set(self, controls: Callable[[], Controls]) -> None:
-        # Where the plugin steps, no other thread uses the data.
-        with self.paused() if self.is_running else _ALONE:
-            ctrl = self._world.data.ctrl
-            for actuator, value in controls():
-                ctrl[actuator] = value
+    def _set(self, command: Command, packet: Packet) -> None:
+        if self.is_running:
+            with self.paused():
+                self._put(command(packet))
+        else:  # where the plugin steps, no other thread uses the data
+            self._put(command(packet))
+
+    def _put(self, controls: Controls) -> None:
+        ctrl = self._world.data.ctrl
+        for actuator, value in controls:
+            ctrl[actuator] = value
 
     def _bout(self, steps: int) -> Mapping[str, Packet]:
         """Up to ``steps`` steps, ending at a firing; the packets that are due then."""
