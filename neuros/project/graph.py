@@ -1,4 +1,4 @@
-"""A project as a picture: in plain text for terminals and code blocks, and for Mermaid."""
+"""The graph of a project: in plain text for terminals and code blocks, and for Mermaid."""
 
 from __future__ import annotations
 

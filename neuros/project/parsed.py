@@ -1,6 +1,6 @@
 """Parsed project: the JSON of its files, node files merged in, before validation.
 
-``--set``, ``--namespace`` and ``--remap`` replace values in it. The form of ``--set``::
+``--set``, ``--namespace``, ``--remap`` and ``--time`` replace values in it. The form of ``--set``::
 
     nodes.NAME.KEY...=VALUE
     connections.SRC.OUT.DST.IN.KEY=VALUE

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import neuros
+from neuros.api.project import StartOptions
 from neuros.cli.main import main
 from neuros.errors import ProjectError
 
@@ -181,10 +182,10 @@ def test_python_programs_get_the_same_as_warnings_and_errors() -> None:
         project = neuros.Project.from_file(".")
     setting = "nodes.robot.environment.SPEDE"
     with pytest.warns(UserWarning, match="reads SPEDE .did you mean 'SPEED'"):
-        project.check_with({setting: 1})
+        project.described(StartOptions(set={setting: 1}))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        project.check_with({"nodes.robot.environment.SPEED": 1})
+        project.described(StartOptions(set={"nodes.robot.environment.SPEED": 1}))
     with pytest.raises(ProjectError, match=TOO_FAST):
         project.validate()
 

@@ -35,7 +35,7 @@ def needs_of(folder: Path, *nodes: dict[str, Any]) -> JobResources:
     project = json.loads(file.read_text())
     project["nodes"] = [{**a, **b} for a, b in zip(project["nodes"], nodes, strict=True)]
     file.write_text(json.dumps(project))
-    return JobResources.of(neuros.Project.from_file(file).check_with({}))
+    return JobResources.of(neuros.Project.from_file(file).described())
 
 
 def test_a_job_asks_for_the_resources_of_all_nodes_summed(tmp_path: Path) -> None:
