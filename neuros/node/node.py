@@ -539,12 +539,8 @@ class NodeRuntime:
         if virtual is None:
             self._tell(request)
             return
-
-        def ask() -> None:
-            virtual.end(drain_s)
-            self._tell(request)
-
-        virtual.post(ask)  # at the end of the hook
+        # At the end of the hook.
+        virtual.post(partial(virtual.end, drain_s, partial(self._tell, request)))
 
     def _end_by_duration(self, duration_s: float) -> None:
         self._services.shutdown(f"{duration_s:g} s of simulated time", 5.0)
