@@ -539,8 +539,11 @@ class NodeRuntime:
         if virtual is None:
             self._tell(request)
             return
-        # At the end of the hook.
-        virtual.post(partial(virtual.end, drain_s, partial(self._tell, request)))
+
+        def tell() -> None:
+            self._tell(request)
+
+        virtual.post(partial(virtual.end, drain_s, tell))  # at the end of the hook
 
     def _end_by_duration(self, duration_s: float) -> None:
         self._services.shutdown(f"{duration_s:g} s of simulated time", 5.0)
