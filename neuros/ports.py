@@ -231,8 +231,11 @@ class NodeLoop(NodeEvents, Protocol):
     def begin(self) -> None:
         """Time 0 of the run has come."""
 
-    def end(self, drain_s: float) -> None:
-        """The node asks for the end: nothing happens after this instant until :meth:`drain`."""
+    def end(self, drain_s: float, tell: Callable[[], None]) -> None:
+        """The node asks for the end: nothing happens after this instant until :meth:`drain`.
+
+        ``tell`` is called if no node has asked before, or at this instant with an earlier name.
+        """
 
     def drain(self, event: Callable[[], None], stop: Callable[[], None], *, is_asked: bool) -> None:
         """Handle ``event`` when the end reaches the node; ``stop`` it if it drains for too long.

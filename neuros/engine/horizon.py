@@ -195,6 +195,7 @@ class Horizon:
         # By neighbour, what it was told, and the first instant that the node has handled since.
         self._told: dict[str, dict[str, KnownState]] = {name: {} for name in self.neighbours}
         self._since_ns: dict[str, int] = {}
+        self._first: dict[str, tuple[int, str]] = {}
         self.begun_ns: int | None = None
         self.causes: Sequence[str] = ()
 
@@ -301,9 +302,20 @@ class Horizon:
             if len(queue) > _MOST_UNHANDLED and queue[_MOST_UNHANDLED] < time_ns:
                 self.causes = [self._outward[number].target]
                 return self._outward[number].target
-        early = [each for each in self._arrivals(awaited) if each[0] <= time_ns]
+        arrivals = [*self._arrivals(awaited)]
+        for name, (first_ns, cause) in self._first.items():
+            arrivals.append((min(first_ns, NEVER_NS - END_NS) + END_NS, name, cause))
+        early = [each for each in arrivals if each[0] <= time_ns]
         self.causes = sorted({cause for _, _, cause in early})
         return min(early)[1] if early else ""
+
+    def behind(self, time_ns: int) -> Sequence[str]:
+        """The nodes that may not have handled all up to a time."""
+        _ = [*self._arrivals(())]
+        self.causes = sorted(
+            {cause for first_ns, cause in self._first.values() if first_ns <= time_ns}
+        )
+        return self.causes
 
     def zero_ns(self, moment: Moment) -> int | None:
         """Time 0 of the run: when nothing is left to do before it; ``None``: not yet.
@@ -411,9 +423,10 @@ class Horizon:
         )
 
     def _arrivals(self, awaited: Sequence[int]) -> Iterable[tuple[int, str, str]]:
-        """The earliest times of messages to the node, and of an end.
+        """The earliest times of messages to the node.
 
-        Each with its sender, and the node whose event may be the first cause of it.
+        Each with its sender, and the node whose event may be the first cause of it. Afterwards,
+        ``_first`` has the earliest event of each node, and its cause.
         """
         states, own = self._states, self._received
         first = {name: state.moment.next_ns for name, state in states.items()}
@@ -476,5 +489,4 @@ class Horizon:
                     if sent_ns < first[target]:
                         first[target], cause[target] = sent_ns, cause[name]
                         heapq.heappush(waiting, (sent_ns, target))
-        for name, time_ns in first.items():
-            yield min(time_ns, NEVER_NS - END_NS) + END_NS, name, cause[name]
+        self._first = {name: (time_ns, cause[name]) for name, time_ns in first.items()}

@@ -540,11 +540,10 @@ class NodeRuntime:
             self._tell(request)
             return
 
-        def ask() -> None:
-            virtual.end(drain_s)
+        def tell() -> None:
             self._tell(request)
 
-        virtual.post(ask)  # at the end of the hook
+        virtual.post(partial(virtual.end, drain_s, tell))  # at the end of the hook
 
     def _end_by_duration(self, duration_s: float) -> None:
         self._services.shutdown(f"{duration_s:g} s of simulated time", 5.0)

@@ -122,9 +122,9 @@ class NodeTime:
         """Time 0 of the run has come."""
         self._loop.begin()
 
-    def end(self, drain_s: float) -> None:
-        """The node asks for the end of the run, at its own time."""
-        self._loop.end(self._name, drain_s)
+    def end(self, drain_s: float, tell: Event) -> None:
+        """The node asks for the end of the run now; ``tell``, if nobody has asked before."""
+        self._loop.end(self._name, drain_s, tell)
 
     def drain(self, event: Event, stop: Event, *, is_asked: bool) -> None:
         """Handle an event when the end of the run reaches the node, before everything else."""
@@ -216,6 +216,7 @@ class VirtualLoop(LocalLoop):
         self._on_limit: list[Event] = []
         self._calls: list[tuple[int, Event]] = []
         self._end: tuple[int, str, int] | None = None  # time, node that asked, time to drain
+        self._tell_end: Event | None = None
 
     def of(self, name: str) -> NodeTime:
         """The clock and the events of a node; the first call tells its place among all nodes."""
@@ -279,13 +280,15 @@ class VirtualLoop(LocalLoop):
         """Call ``event`` so long after time 0, before anything else happens at that time."""
         self._calls.append((round(time_s * 1e9), event))
 
-    def end(self, name: str, drain_s: float) -> None:
+    def end(self, name: str, drain_s: float, tell: Event | None = None) -> None:
         """A node asks for the end, or nobody (``""``): what comes later than now waits.
 
-        The end reaches the other nodes after :data:`neuros.engine.horizon.END_NS`.
+        The end reaches the other nodes after :data:`neuros.engine.horizon.END_NS`. If several ask
+        at one instant, the first by name does. ``tell`` is called when it is certain.
         """
-        if self._end is None:
-            self._end = self.now_ns, name, round(drain_s * 1e9)
+        asked = self.now_ns, name, round(drain_s * 1e9)
+        if self._end is None or asked < self._end:
+            self._end, self._tell_end = asked, tell
             self.limit_ns, self._on_limit = self.now_ns + 1, []
 
     def drain(self, name: str, stop: Event) -> int:
@@ -320,6 +323,16 @@ class VirtualLoop(LocalLoop):
                 self.queue(each, place)
             return True
         node = self._next_node()
+        if (
+            self._tell_end is not None
+            and self._end is not None
+            and (node is None or node.queued_ns is None or node.queued_ns > self._end[0])
+        ):
+            if not self._is_first(self._end[0]):
+                return False
+            tell, self._tell_end = self._tell_end, None
+            tell()
+            return True
         if node is None or node.queued_ns is None:
             return False
         time_ns, limit_ns = node.queued_ns, self.limit_ns
@@ -375,6 +388,10 @@ class VirtualLoop(LocalLoop):
 
     def _may_handle(self, time_ns: int) -> bool:
         """Whether nothing can arrive any more before the events of a time."""
+        return True
+
+    def _is_first(self, time_ns: int) -> bool:
+        """Whether no node can ask for an end at this time or before any more."""
         return True
 
     def _come_to_limit(self, limit_ns: int) -> bool:

@@ -185,7 +185,7 @@ class RosVirtualLoop(VirtualLoop):
             and not self._is_draining
             and (self._end is None or ending < Ending(*self._end))
         ):
-            self._end = ending.time_ns, ending.node, ending.drain_ns
+            self._end, self._tell_end = (ending.time_ns, ending.node, ending.drain_ns), None
             late_ns = END_NS if ending.node else 0
             self.limit_ns, self._on_limit = ending.time_ns + late_ns, []
         self._wake()
@@ -250,6 +250,11 @@ class RosVirtualLoop(VirtualLoop):
     def _is_behind_time_0(self) -> bool:
         """Whether time 0 has come elsewhere: what arrives from there is later."""
         return not self.has_begun and self.horizon.have_others_begun
+
+    def _is_first(self, time_ns: int) -> bool:
+        causes = self.horizon.behind(time_ns)
+        self._waits_ns = time_ns if causes else -1
+        return not causes
 
     def _can_go_on(self) -> bool:
         return not self._is_behind_time_0 and super()._can_go_on()

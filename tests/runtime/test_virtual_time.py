@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,20 @@ def tick(node: Any) -> Any:
     packet = node.make_packet("x")
     packet.data = float(ns(node))
     return packet
+
+
+@neuros_tick(seconds=0.01, outputs="x")
+def tick_to_the_end(node: Any) -> Any:
+    """Ends the run at END_MS, SLEEP_S late on the clock of the machine."""
+    now = node.now()
+    if now.sec * 1000 + now.nanosec / 1e6 >= float(os.environ["END_MS"]):
+        time.sleep(float(os.environ.get("SLEEP_S", "0")))
+        node.shutdown(f"at {os.environ['END_MS']} ms")
+    return node.make_packet("x")
+
+
+@neuros_function(inputs="x")
+def take(node: Any, x: Any) -> None: ...
 
 
 class Log:
@@ -402,6 +418,27 @@ def test_the_end_that_a_hook_asks_for_reaches_the_others_after_100_ms(tmp_path: 
         for name, node in ended.record["nodes"].items()
     }
     assert executions == {"a": [5], "b": [14], "alone": [14]}  # the end comes before the 15th tick
+
+
+@pytest.mark.parametrize("backend", ["in-process", "process"])
+def test_the_first_node_that_asks_ends_the_run_and_at_one_instant_the_first_by_name(
+    tmp_path: Path, backend: str
+) -> None:
+    def reason(*ends: dict[str, str]) -> str:
+        nodes = [
+            neuros.Node(name, tick_to_the_end, outputs={"x": FLOAT}, environment=end)
+            for name, end in zip("cb", ends, strict=True)
+        ]
+        a = neuros.Node("a", take, inputs={"x": FLOAT})
+        folder = tmp_path / f"{len([*tmp_path.iterdir()])}"
+        folder.mkdir()
+        wires = [node["x"] >> a["x"] for node in nodes]
+        described = neuros.Project([*nodes, a], wires, folder=folder, time="virtual")
+        return described.run(backend=backend, output=folder / "run").reason
+
+    early, slowly = {"END_MS": "50"}, {"END_MS": "50", "SLEEP_S": "0.3"}
+    assert reason(early, slowly) == "b ended the project: at 50 ms"
+    assert reason(slowly, {"END_MS": "60"}) == "c ended the project: at 50 ms"
 
 
 # ---------------------------------------------------------------------- what is refused
