@@ -344,6 +344,11 @@ class Horizon:
         """Whether time 0 of the run has come at another node."""
         return any(state.moment.zero_ns >= 0 for state in self._states.values())
 
+    @property
+    def is_under_way(self) -> bool:
+        """Whether a message has been sent of which no neighbour has told yet that it has come."""
+        return any(self._under_way.values())
+
     def ending(self) -> Ending | None:
         """The earliest end of the run that another node knows."""
         known = (s.moment.ending for s in self._states.values())

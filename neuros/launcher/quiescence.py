@@ -226,9 +226,13 @@ def under_way(probes: Probes, connections: Sequence[Connection]) -> list[str]:
 
 
 def is_drained(probes: Probes, connections: Sequence[Connection]) -> bool:
-    """Whether no reliable packet is under way, and none waits that some hook could start on."""
+    """Whether no reliable packet is under way, and none waits that some hook could start on.
+
+    In virtual time, all that happens counts, so no packet at all may be under way.
+    """
     return not under_way(probes, connections) and not any(
-        probe.is_startable for probe in probes.values()
+        probe.is_startable or (probe.virtual_s is not None and not probe.is_idle)
+        for probe in probes.values()
     )
 
 

@@ -167,6 +167,12 @@ class RosVirtualLoop(VirtualLoop):
 
         super().plan(duration_s, end, real_time_factor)
 
+    @property
+    def has_waiting_events(self) -> bool:
+        # What a neighbour has not handled counts at its sender: no probe sees it under way.
+        is_under_way = self._drain is not None or self.horizon.is_under_way
+        return is_under_way or super().has_waiting_events
+
     # ------------------------------------------------------------------ what arrives
 
     def arrive(self, connection: Connection, event: Event) -> None:
@@ -303,7 +309,10 @@ class RosVirtualLoop(VirtualLoop):
             if time.monotonic_ns() > end_ns and node.next_ns != node.now_ns:
                 self._wake()
                 break
-        self.tell()
+        if self._is_draining:
+            self.tell_all()
+        else:
+            self.tell()
 
 
 class VirtualSendingLink(SendingLink):

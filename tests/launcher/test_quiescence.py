@@ -105,6 +105,16 @@ def test_packets_that_may_be_lost_do_not_hold_up_the_end() -> None:
     assert reliable_counters(probes, [LOSSY]) == ()
 
 
+def test_in_virtual_time_they_do_since_they_arrive_at_the_same_time_in_every_run() -> None:
+    probes = {
+        "a": sender(LOSSY, 9, 0, is_idle=False, virtual_s=0.5),
+        "b": receiver(LOSSY, 4, 0, virtual_s=0.5),
+    }
+    assert not is_drained(probes, [LOSSY])
+    probes["a"] = sender(LOSSY, 9, 0, virtual_s=0.5)
+    assert is_drained(probes, [LOSSY])
+
+
 def test_connections_to_nodes_that_never_began_do_not_count() -> None:
     assert is_drained({"a": sender(AB, 0, 0)}, [AB])
 
