@@ -55,6 +55,7 @@ napoleon_use_ivar = True
 toc_object_entries = False
 # What an installation without further extras has not; no page says anything about these.
 autodoc_mock_imports = [
+    "launch",
     "debugpy",
     "hypothesis",
     "mujoco",

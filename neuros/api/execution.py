@@ -152,9 +152,9 @@ class Execution:
             if self._plan.back_end.is_forked:
                 messages = self._plan.messages
                 ports = [port for f in self._files for port in (*f.node.inputs, *f.node.outputs)]
-                packages = sorted({port.ros_type.partition("/")[0] for port in ports})
+                types = sorted({port.ros_type for port in ports})
                 guardian.import_early(
-                    *([f"{package}.msg"] for package in packages),
+                    ["neuros.cli.node", "load_messages", *types],
                     folders=messages.paths if messages else (),
                 )
             its_mark = mark(self._session(started))

@@ -99,11 +99,9 @@ def show_as(command: Sequence[str], environment: Mapping[str, str]) -> bool:
     size = ctypes.c_ulong(len(given))
     is_shown = bool(libc.prctl(_PR_SET_MM, _PR_SET_MM_MAP, given, size, 0) == 0)
     if is_shown:
-        _SHOWN.append(shown)  # the kernel reads it there from now on
+        # The kernel reads it there from now on, also while Python frees all that it holds at exit.
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(shown))
     return is_shown
-
-
-_SHOWN: list[object] = []
 
 
 def _numbers() -> Iterator[str]:

@@ -44,6 +44,19 @@ def load_transport(name: str) -> TransportKind:
         return TRANSPORTS.load(name)
 
 
+def load_messages(*names: str) -> None:
+    """Import messages, and NumPy if a packet of one has arrays; forks of this process share both.
+
+    Args:
+        names: of their types, such as ``std_msgs/msg/String``.
+    """
+    with imports_when_used():
+        from neuros.transport.messages import make_packet
+
+        for name in names:
+            make_packet(name)
+
+
 def _run_node(options: argparse.Namespace) -> int:
     """Run the nodes of the given ``node.json`` files until they are asked to end."""
     # At exit Python closes the files that a plugin left open, but not among frozen objects.

@@ -250,7 +250,7 @@ def read_as(declared: type[_Declared], content: Any) -> _Declared:
     """
     try:
         return msgspec.convert(content, declared)
-    except msgspec.ValidationError as error:
+    except (msgspec.ValidationError, UnicodeEncodeError) as error:  # a key may be a lone surrogate
         raise ControlError(str(error)) from None
 
 

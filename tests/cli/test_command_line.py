@@ -488,7 +488,7 @@ def test_digests_need_a_packet_log(project: Path, capsys: pytest.CaptureFixture[
         ("replay p --rate fast", "'fast' is not a number"),
         ("launch p -o", "argument -o/--output: needs a value"),
         ("launch p --progress=3", "takes no value, but is given '3'"),
-        ("verify a", "it is missing: RUN_B"),
+        ("bag info", "it is missing: RUN"),
     ],
 )
 def test_a_mistyped_command_line_is_answered_in_words(

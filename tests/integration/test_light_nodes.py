@@ -37,7 +37,9 @@ NUMPY = {
 @pytest.mark.parametrize(
     ("backend", "types"),
     [
-        ("process", [*NUMPY]),
+        # Nodes are forked from one process, which has imported the messages of all.
+        ("process", [each for each, found in NUMPY.items() if not found]),
+        ("process", ["sensor_msgs/msg/Imu"]),
         ("in-process", ["std_msgs/msg/Float64MultiArray"]),
         ("in-process", ["sensor_msgs/msg/Imu"]),
     ],
