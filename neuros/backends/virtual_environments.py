@@ -359,6 +359,16 @@ def unmet(requirements: Requirements, *, any_version: bool = False) -> list[str]
     return list(dict.fromkeys(lack for line in lines for lack in _lacks(line, any_version)))
 
 
+def _another_ros_has(name: str) -> bool:
+    """Whether a ROS distribution that is sourced, or wheels of another one, have a package."""
+    wheel = re.fullmatch(r"ros-[a-z]+-(.+)", name)
+    if wheel is None:
+        return False
+    marker = Path("share/ament_index/resource_index/packages", wheel[1].replace("-", "_"))
+    sourced = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
+    return any((Path(prefix) / marker).exists() for prefix in (*sourced, sys.prefix))
+
+
 def _lacks(line: Line, any_version: bool) -> Iterator[str]:
     from packaging.requirements import InvalidRequirement, Requirement
 
@@ -379,7 +389,7 @@ def _lacks(line: Line, any_version: bool) -> Iterator[str]:
         except (importlib.metadata.PackageNotFoundError, FileNotFoundError, KeyError):
             version = ""
         if not version:  # or an interrupted pip has left a part of the package
-            if not line.is_constraint:
+            if not (line.is_constraint or (any_version and _another_ros_has(wanted.name))):
                 yield f"{text} (not installed)"
             continue
         fits = any_version or wanted.specifier.contains(version, prereleases=True)

@@ -92,3 +92,16 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     file.write_bytes(b"\xff")
     with pytest.raises(EnvironmentFault, match=r"requirements\.txt is not valid UTF-8"):
         read_requirements(file)
+
+
+def test_packages_of_a_sourced_ros_distribution_stand_for_wheels_in_own_containers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = "ros-jazzy-no-such-package==1.0"
+    assert lacks(tmp_path, text, any_version=True) == [f"{text} (not installed)"]
+    index = tmp_path / "ros" / "share" / "ament_index" / "resource_index" / "packages"
+    index.mkdir(parents=True)
+    (index / "no_such_package").touch()
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere:{tmp_path / 'ros'}")
+    assert lacks(tmp_path, text, any_version=True) == []
+    assert lacks(tmp_path, text) == [f"{text} (not installed)"]
