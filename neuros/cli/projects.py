@@ -276,7 +276,10 @@ def _example(options: argparse.Namespace) -> int:
         others = [file.name for file in files if "nodes" in json.loads(file.read_text("utf-8"))]
         print(f"copied to {folder}; the next command: neuros launch {folder}")
         if others:
-            print(f"variants of it, as neuros launch {folder / others[0]}: {', '.join(others)}")
+            print(
+                f"{len(others)} variants of it, such as neuros launch {folder / others[0]}:"
+                f" {folder / 'README.md'} says what each shows"
+            )
     else:
         hint = did_you_mean(name, folders) or f"there are {', '.join(folders)}"
         raise UsageError(f"there is no example '{name}' ({hint})")
