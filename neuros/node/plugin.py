@@ -14,9 +14,11 @@ import sys
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from neuros.errors import NO_WAITING, NeurosError, NodeError, PluginError
 from neuros.hooks import HookSpec, hook_specs_of
+from neuros.project.model import Node
 
 PREFIX = "neuros_plugin_"
 """Of the last word in the module name of each plugin."""
@@ -27,11 +29,14 @@ _GONE_MODULES = {
 }
 
 
-def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[HookSpec]:
+def load_plugin(
+    path: Path, node_name: str, module_name: str = "", node: Node | None = None
+) -> Sequence[HookSpec]:
     """Import a plugin under a name of its node's own, and return its hooks in order.
 
     One of an installed package (``module_name``) is imported anew, too, within its package; what it
-    imports itself is shared with the other nodes of the process.
+    imports itself is shared with the other nodes of the process. If it has a function ``hooks_of``,
+    its hooks are the functions that this returns for the description of ``node``.
 
     Raises:
         PluginError: if it cannot be imported (with the traceback from the plugin on), or
@@ -57,6 +62,9 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
         if package:
             importlib.import_module(package)
         spec.loader.exec_module(module)
+        hooks: Mapping[Any, Any] = vars(module)
+        if node is not None and node.module and "hooks_of" in hooks:
+            hooks = dict(enumerate(hooks["hooks_of"](node)))
     except NeurosError:
         raise
     except BaseException as error:
@@ -72,7 +80,7 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
         ) from error
     finally:
         sys.setdlopenflags(flags)
-    specs = hook_specs_of(vars(module))
+    specs = hook_specs_of(hooks)
     if not specs:
         raise PluginError(
             f"{path}: declares no hooks: mark functions with @neuros_function or @neuros_tick"
