@@ -82,6 +82,7 @@ class SweepOptions:
     duration: float | str | None = like(Request, "duration")
     portable: bool | None = like(Request, "portable")
     record: bool | Sequence[str] = like(Request, "record", group="")
+    restore: Mapping[str, Any] | Sequence[str] = like(Request, "restore", group="")
     output: str | os.PathLike[str] | None = option(
         "-o",
         "--output",

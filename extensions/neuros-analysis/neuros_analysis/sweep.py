@@ -21,6 +21,7 @@ from typing import Any
 
 from tabulate import tabulate
 
+from neuros.api.kept import find_sources, given_sources
 from neuros.api.live import LiveRun
 from neuros.api.loading import override_texts, value_text
 from neuros.api.plan import time_problems
@@ -42,7 +43,8 @@ _STOP_NAME = ".sweep.stop"  # exists from the interruption of a sweep until its 
 CSV_NAME = "sweep.csv"
 _WAIT_S = 1.0
 _PAUSE_PER_WRITING = 100.0  # writing the table uses at most 1 % of a core, however long it is
-_OF_EACH_RUN = ("backend", "duration", "portable", "record")
+_OF_EACH_RUN = ("backend", "duration", "portable", "record")  # as given
+_OF_EACH_JOB = (*_OF_EACH_RUN, "restore")
 _REASON_CHARACTERS = 50
 _COUNTS = (": sent", ": consumed")
 _MOST_CHARACTERS = 80
@@ -129,7 +131,13 @@ def sweep(project: Project | str | os.PathLike[str], options: SweepOptions) -> S
     if (back_end := request.backend or AUTO) != AUTO:
         BACK_ENDS.load(back_end)  # raises here once, not in each run
     resources = _check_all(project, points, request)
-    folder = _sweep_folder(project, options)
+    given = given_sources(options.restore)
+    sources = find_sources(given, [node.name for node in project.described().nodes])
+    restore = {
+        f"{node}.{name}": str(file) for node in sources for name, file in sources[node].items()
+    }
+    request = replace(request, restore=restore)
+    folder = _sweep_folder(project, options, restore)
     with _locked_folder(folder):
         return _Sweeping(project, points, folder, options, request).run(resources)
 
@@ -179,7 +187,7 @@ class _Sweeping:
                 {
                     "set": override_texts(point.settings),
                     "seed": point.seed,
-                    **{key: getattr(request, key) for key in _OF_EACH_RUN},
+                    **{key: getattr(request, key) for key in _OF_EACH_JOB},
                 },
                 folder / name,
                 folder / _STOP_NAME,
@@ -294,7 +302,7 @@ def _check_all(project: Project, points: Sequence[Point], request: Request) -> J
     return JobResources.most(needs)
 
 
-def _sweep_folder(project: Project, options: SweepOptions) -> Path:
+def _sweep_folder(project: Project, options: SweepOptions, restore: Mapping[str, str]) -> Path:
     """The folder of a new sweep, or of the one to continue. Raises ``UsageError``."""
     stamp = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
     folder = Path(options.output or Path("runs", project.name, f"sweep-{stamp}")).absolute()
@@ -302,13 +310,14 @@ def _sweep_folder(project: Project, options: SweepOptions) -> Path:
         "project": str(project.file),
         "project_sha256": hashlib.sha256(project.text().encode()).hexdigest(),
         **{name: str(getattr(options, name)) for name in _OF_EACH_RUN},
+        **({"restore": restore} if restore else {}),
     }
     file = folder / _PLAN_NAME
     try:
         if file.exists():
             before = read_object(file)
-            for name, value in plan.items():
-                if before.get(name) != value:
+            for name in [*plan, "restore"]:
+                if before.get(name) != plan.get(name):
                     is_text = name == "project_sha256"
                     what = "the project's files differ" if is_text else f"its {name} differs"
                     raise UsageError(

@@ -86,6 +86,37 @@ def test_an_optimiser_asks_for_points_and_is_told_their_rows(tmp_path: Path) -> 
     assert again.rows == runs.rows[:1], "it was not run again"
 
 
+def test_each_run_begins_with_what_is_restored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plugin = """
+from neuros.hooks import neuros_function, neuros_initialise
+
+@neuros_initialise()
+def begin(node):
+    runs = [0]
+    node.keep("runs", lambda: runs, lambda kept: runs.__setitem__(slice(None), kept))
+    runs[0] += 1
+    node.set_result("runs", runs[0])
+
+@neuros_function(inputs="eyes")
+def end(node, eyes):
+    node.shutdown("seen")
+"""
+    project = neuros.Project.from_file(dice(tmp_path, plugin))
+    first = project.run(backend="in-process", output="first", check=True)
+    seeds = {"seeds": (1, 2), "backend": "in-process", "output": "table"}
+    made = neuros.sweep(project, restore={"counter.runs": first}, **seeds)
+    assert [row["counter.runs"] for row in made.rows] == [2, 2]
+    with pytest.raises(UsageError, match=r"a sweep that is not this one .its restore differs"):
+        neuros.sweep(project, **seeds)
+    arguments = ["sweep", "dice", "--backend", "in-process", "-o", "other"]
+    assert main([*arguments, "--restore", "counter.runs=table"]) == 2
+    assert not Path("other").exists()
+    assert main([*arguments, "--restore", "counter.runs=first"]) == 0
+    capsys.readouterr()
+
+
 def test_points_have_the_same_paths(tmp_path: Path) -> None:
     project = neuros.Project.from_file(dice(tmp_path, COUNTER))
     with pytest.raises(UsageError, match="points: number 2 has other paths than the first one"):

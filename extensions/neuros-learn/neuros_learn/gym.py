@@ -412,7 +412,8 @@ class ProjectEnv(_World, gymnasium.Env[Any, Any]):
         """Begin an episode: reset the session with the next seed, and run until all outputs sent.
 
         Args:
-            options: ``{"set": {...}}``: settings, as for :meth:`Session.reset`.
+            options: ``{"set": {...}, "keep": ...}``: settings, and what survives of that which
+                plugins keep, as for :meth:`Session.reset`.
 
         Raises:
             UsageError: an observed output does not send, or there is another option.
@@ -451,6 +452,8 @@ class ProjectEnv(_World, gymnasium.Env[Any, Any]):
         image = self.session[name].packet
         if image is None:
             return _black(name, port)
+        if port.array:
+            return image
         try:
             pixels = image_pixels(image)
         except ValueError as error:
@@ -465,7 +468,7 @@ class ProjectEnv(_World, gymnasium.Env[Any, Any]):
 class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
     """The copies of the nodes of a project, as environments that are stepped at once.
 
-    The arguments are those of :class:`ProjectEnv`, without ``model`` and pictures. Values have a
+    The arguments are those of :class:`ProjectEnv`, without ``model``. Values have a
     leading axis of ``num_envs``: actions, observations, and those that the functions are given and
     return. As in Gymnasium's own vectors, an environment whose episode is over begins the next one
     in the step after that: its action is ignored, and its reward is 0.
@@ -479,6 +482,9 @@ class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
         reward, done, truncated, info: functions; each returns an array with a value for each copy,
             or one for all, ``info`` a mapping of such.
         max_episode_steps: the number of steps after which an episode is ``truncated``.
+        render_mode: ``"rgb_array"``, or ``None``: pictures are not asked for.
+        render: the output that sends a picture of each copy, ``uint8[height,width,3]``; it may be
+            left out if there is only one.
         ranges, rounds, sim_s, initial_action, backend, options: as of :class:`ProjectEnv`.
 
     Attributes:
@@ -512,15 +518,19 @@ class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
         rounds: int | None = None,
         sim_s: float | None = None,
         initial_action: Any = None,
+        render_mode: str | None = None,
+        render: str | None = None,
         backend: str = "local",
         **options: Any,
     ) -> None:
         _check_names(options, ProjectVectorEnv)
         _check_steps(max_episode_steps)
-        check_length(rounds, sim_s)
+        count = check_length(rounds, sim_s)
         loaded, self._copied = _with_copies(project, num_envs)
         described = loaded.described(is_held=True)
         self.num_envs = described.node(self._copied[0]).copies or 1
+        self._camera = _camera(described, render_mode, render, self.num_envs)
+        self.render_mode = render_mode
         self._masked = _inputs_behind(described, reset)
         for type_ in {_port(described, name).type for name in self._masked}:
             if type_ != f"bool[{self.num_envs},1]":
@@ -542,6 +552,9 @@ class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
             also_taken=self._masked,
         )
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
+        if self._camera is not None:
+            fps = _steps_per_s(described, count, sim_s)
+            self.metadata |= {"render_modes": [_RENDER_MODE], "render_fps": fps}
         self.single_action_space = _space(self.action_signals, is_one=self._has_one_action)
         self.single_observation_space = _space(
             self.observation_signals, is_one=self._has_one_observation
@@ -563,7 +576,7 @@ class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
         Args:
             seed: ``1``: environment i has the seed 1 + i, as in Gymnasium's own vectors; or one for
                 each; ``None``: the next ones. A node has them as ``node.seeds``.
-            options: ``{"set": {...}}``: settings, as for :meth:`Session.reset`.
+            options: as of :meth:`ProjectEnv.reset`.
 
         Raises:
             UsageError: an observed output does not send, there is another option, or another number
@@ -585,7 +598,7 @@ class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
         own = [new if each is None else int(each) for each, new in zip(wanted, drawn, strict=False)]
         variables = {f"nodes.{name}.environment.{SEEDS}": json.dumps(own) for name in self._copied}
         settings = {**variables, **changes.get("set", {})}
-        self._begin(drawn[-1] if self._has_seeds else None, {"set": settings})
+        self._begin(drawn[-1] if self._has_seeds else None, {**changes, "set": settings})
         self._begin_all()
         return self.observation, self._information(self._seen(None))
 
@@ -616,6 +629,18 @@ class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
             terminations[:] = True
         self._over = terminations | truncations
         return self.observation, rewards, terminations, truncations, self._information(seen)
+
+    def render(self) -> tuple[Any, ...] | None:
+        """The newest picture of each copy, ``(height, width, 3)``, uint8, red first.
+
+        They are black before the first ones of an episode.
+        """
+        if self.render_mode is None or self._camera is None:
+            logger.warn(f"render: make the environment with render_mode='{_RENDER_MODE}'")
+            return None
+        name, port = self._camera
+        images = self.session[name].packet
+        return tuple(_black(name, port) if images is None else images)
 
     def close_extras(self, **_: Any) -> None:
         """End the run, drained."""
@@ -787,21 +812,24 @@ def _by_names(role: str, function: Callable[..., Any]) -> Callable[[Mapping[str,
 def _changes(options: Mapping[str, Any] | None) -> dict[str, Any]:
     """The arguments of :meth:`Session.reset` in the options of a reset; raises ``UsageError``."""
     for name in options or ():
-        if name != "set":
+        if name not in ("set", "keep"):
             raise UsageError(
                 f"reset: there is no option '{name}'; settings are"
-                ' options={"set": {"nodes.NAME.environment.VARIABLE": value}}'
+                ' options={"set": {"nodes.NAME.environment.VARIABLE": value}}, and "keep" names'
+                " what plugins keep"
             )
     settings = (options or {}).get("set")
     if not isinstance(settings, Mapping | None):
         raise UsageError(f"reset: options: 'set' is a mapping of settings, not {settings!r}")
-    return {} if settings is None else {"set": settings}
+    return {name: value for name, value in (options or {}).items() if value is not None}
 
 
 def _camera(
-    project: Described, render_mode: str | None, render: str | None
+    project: Described, render_mode: str | None, render: str | None, copies: int | None = None
 ) -> tuple[str, Port] | None:
     """The output that sends the pictures, and its name; ``None`` if none is needed, nor clear.
+
+    ``copies``: whose pictures are an array with a leading axis.
 
     Raises:
         UsageError: if it cannot be had.
@@ -810,14 +838,16 @@ def _camera(
         raise UsageError(f"render_mode={render_mode!r}: there is '{_RENDER_MODE}', or None")
     if render is not None:
         port = _port(project, render, is_output=True)
-        if port.type != _IMAGE:
-            raise UsageError(f"render='{render}': the output sends {port.type}, not {_IMAGE}")
+        if not _is_picture(port, copies):
+            raise UsageError(
+                f"render='{render}': the output sends {port.type}, not {_pictures(copies)}"
+            )
         return render, port
     cameras = [
         (f"{node.name}.{port.name}", port)
         for node in project.nodes
         for port in node.outputs
-        if port.type == _IMAGE
+        if _is_picture(port, copies)
     ]
     if len(cameras) == 1:
         return cameras[0]
@@ -825,11 +855,29 @@ def _camera(
         return None
     names = [name for name, _ in cameras]
     if not names:
-        raise UsageError(f"render_mode='{render_mode}': no output of {project.name} sends {_IMAGE}")
+        raise UsageError(
+            f"render_mode='{render_mode}': no output of {project.name} sends {_pictures(copies)}"
+        )
     raise UsageError(
         f"render_mode='{render_mode}': {project.name} has the cameras {', '.join(names)}: choose"
         f" one, for example with render='{names[0]}'"
     )
+
+
+def _is_picture(port: Port, copies: int | None) -> bool:
+    """Whether the packets of an output are pictures, or arrays with one of each copy."""
+    array = port.array
+    if array is None:
+        return port.type == _IMAGE and copies is None
+    shape = array.shape
+    if copies is not None:
+        shape = shape[1:] if shape[0] == copies else ()
+    return array.dtype == "uint8" and len(shape) == 3 and shape[2] == 3
+
+
+def _pictures(copies: int | None) -> str:
+    one = "uint8[height,width,3]"
+    return f"{_IMAGE} or {one}" if copies is None else f"{one} of each copy"
 
 
 def _steps_per_s(project: Described, rounds: int, sim_s: float | None) -> float:
@@ -842,6 +890,8 @@ def _steps_per_s(project: Described, rounds: int, sim_s: float | None) -> float:
 
 def _black(name: str, port: Port) -> Any:
     """The picture of a camera that has sent none: another size later would spoil a video."""
+    if port.array:
+        return np.zeros(port.array.shape, np.uint8)
     if not port.mujoco:
         raise UsageError(
             f"render: {name} has sent no picture yet in this episode: let the hook that begins an"

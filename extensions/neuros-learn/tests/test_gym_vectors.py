@@ -64,6 +64,25 @@ def step(node, force, reset):
     worlds.step(force, 2, reset=reset)
     return worlds.read("qpos", "qvel")
 """
+LEARNING = """
+import numpy as np
+from neuros.hooks import Optional, neuros_function, neuros_initialise
+
+
+@neuros_initialise(outputs="joints", batch=True)
+def begin(node):
+    learnt = np.zeros(1)
+    node.set_user_data(learnt)
+    node.keep("learnt", lambda: learnt, lambda kept: np.copyto(learnt, kept))
+    return node.make_packet("joints") + learnt
+
+
+@neuros_function(inputs=[Optional("force"), Optional("reset")], outputs="joints", batch=True)
+def step(node, force, reset):
+    learnt = node.get_user_data()
+    learnt += 1
+    return node.make_packet("joints") + learnt
+"""
 NODE: dict[str, Any] = {
     "name": "poles",
     "container": "neuros_mujoco",
@@ -241,6 +260,51 @@ def test_settings_at_a_reset_hold_until_the_next_one(envs: Any) -> None:
         envs.reset(options={"reset_mask": np.ones(COPIES, bool)})
 
 
+def test_what_plugins_keep_survives_a_reset_if_asked(folder: Path) -> None:
+    write(folder, LEARNING)
+    made = poles(folder)
+
+    def learnt(**options: Any) -> float:
+        """At the beginning of an episode, one step of which follows."""
+        observation, _ = made.reset(seed=1, options=options)
+        made.step(np.zeros((COPIES, 1)))
+        return float(observation[0, 0])
+
+    assert learnt() == 0
+    assert learnt(keep="poles.learnt") == 1
+    assert learnt(keep=True) == 2
+    assert learnt(keep=False) == 0
+    with pytest.raises(UsageError, match="keep: nothing in node 'poles' keeps 'learned'"):
+        made.reset(options={"keep": "poles.learned"})
+    made.close()
+
+
+def test_pictures_are_arrays_of_all_copies(folder: Path) -> None:
+    head, _, _ = PLUGIN.rpartition("@neuros_function")
+    plugin = f"""{head}
+@neuros_function(
+    inputs=[Optional("force"), Optional("reset")], outputs=["joints", "picture"], batch=True
+)
+def step(node, force, reset):
+    worlds, picture = node.get_user_data(), node.make_packet("picture")
+    worlds.step(force, 2, reset=reset)
+    picture[:, 1, 2, 0] = range(10, 10 + node.copies)
+    return worlds.read("qpos", "qvel"), picture
+"""
+    outputs = [*NODE["outputs"], {"name": "picture", "type": "uint8[4,6,3]"}]
+    write(folder, plugin, outputs=outputs)
+    made = poles(folder, render_mode="rgb_array")
+    assert made.render_mode == "rgb_array"
+    assert made.metadata["render_modes"] == ["rgb_array"]
+    made.reset(seed=1)
+    assert [picture.shape for picture in made.render()] == [(4, 6, 3)] * COPIES
+    made.step(np.zeros((COPIES, 1)))
+    pictures = made.render()
+    assert pictures is not None
+    assert [int(picture[1, 2, 0]) for picture in pictures] == [10, 11, 12, 13, 14]
+    made.close()
+
+
 def test_num_envs_is_by_default_that_of_the_project(folder: Path) -> None:
     made = poles(folder, num_envs=None)
     assert made.num_envs == 2
@@ -399,7 +463,14 @@ def test_a_failing_hook_is_told(folder: Path) -> None:
         ({"ranges": {"poles.torque": (0, 1)}}, "ranges: 'poles.torque' is none of"),
         ({"max_episode_steps": 0}, "max_episode_steps=0: give a whole number from 1 on"),
         ({"model": "pole.xml"}, "neuros.gym.make_vec has no argument 'model'"),
-        ({"render_mode": "rgb_array"}, "make_vec has no argument 'render_mode'"),
+        (
+            {"render_mode": "rgb_array"},
+            r"no output of .* sends uint8\[height,width,3\] of each copy",
+        ),
+        (
+            {"render": "poles.joints"},
+            r"'poles.joints': the output sends float64\[5,4\], not uint8",
+        ),
         ({"reward": lambda state: 0}, "reward: there is nothing for its parameter 'state'"),
         ({"rounds": -1}, "rounds"),
     ],

@@ -650,7 +650,7 @@ def test_an_environment_of_another_world_is_refused(tmp_path: Path) -> None:
 
 
 class TestLeRobot:
-    """Policies of LeRobot; a module stands in for the library, which brings PyTorch."""
+    """Policies of LeRobot; a module stands in for the library but where that is installed."""
 
     @pytest.fixture
     def folder(self, tmp_path: Path) -> Path:
@@ -721,6 +721,64 @@ class TestLeRobot:
         assert batch["observation.state"].shape == (1, 2)
         assert batch["observation.images.front"].shape == (1, 3, 4, 5)
         assert np.allclose(batch["observation.images.front"], 0.2)
+
+    @pytest.mark.acceptance
+    def test_a_policy_acts_as_in_lerobot_s_own_loop(self, tmp_path: Path) -> None:
+        pytest.importorskip("lerobot", reason="pip install lerobot")
+        import torch
+        from lerobot.configs.types import FeatureType, PolicyFeature
+        from lerobot.policies.act.configuration_act import ACTConfig
+        from lerobot.policies.act.modeling_act import ACTPolicy
+        from lerobot.policies.factory import make_pre_post_processors
+        from lerobot.utils.control_utils import predict_action
+
+        torch.set_num_threads(1)  # as the node; others sum in another order
+        front, place = "observation.images.front", tmp_path / "act"
+        small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1}
+        config = ACTConfig(
+            input_features={
+                "observation.state": PolicyFeature(FeatureType.STATE, (4,)),
+                front: PolicyFeature(FeatureType.VISUAL, (3, 64, 64)),
+            },
+            output_features={"action": PolicyFeature(FeatureType.ACTION, (1,))},
+            pretrained_backbone_weights=None,
+            use_vae=False,
+            chunk_size=8,
+            n_action_steps=4,
+            device="cpu",
+            **small,
+        )
+        policy = ACTPolicy(config)
+        policy.save_pretrained(place)
+        shapes = {"observation.state": (4,), front: (3, 1, 1), "action": (1,)}
+        statistics = {
+            name: {"mean": torch.full(shape, 0.1), "std": torch.full(shape, 0.5)}
+            for name, shape in shapes.items()
+        }
+        before, after = make_pre_post_processors(config, dataset_stats=statistics)
+        before.save_pretrained(place)
+        after.save_pretrained(place)
+        observed = {"observation.state": "state", front: "camera.data[64,64,3]"}
+        inputs = {"state": "float64[4]", "camera": IMAGE}
+        node = harness(
+            "lerobot:act", inputs, {"action": "float64[1]"}, tmp_path, observation=observed
+        )
+        random = np.random.default_rng(1)
+        policy.reset()
+        wanted = []
+        for _ in range(6):
+            state = random.normal(size=4)
+            pixels = random.integers(0, 256, (64, 64, 3), dtype=np.uint8)
+            packet = node.make_packet("camera")
+            packet.data = pixels.ravel()
+            node.send("state", state)
+            node.send("camera", packet)
+            seen = {"observation.state": state.astype(np.float32), front: pixels}
+            cpu = torch.device("cpu")
+            action = predict_action(seen, policy.eval(), cpu, before, after, use_amp=False)
+            wanted.append([float(action)])
+        node.run()
+        assert np.array_equal(node.received("action"), wanted)
 
     def test_without_the_library_the_node_names_it(self, folder: Path) -> None:
         ports = {"state": "float64[2]"}, {"action": "float64[1]"}
