@@ -29,21 +29,22 @@ _GONE_MODULES = {
 }
 
 
-def load_plugin(
-    path: Path, node_name: str, module_name: str = "", node: Node | None = None
-) -> Sequence[HookSpec]:
-    """Import a plugin under a name of its node's own, and return its hooks in order.
+def load_plugin(node: Node) -> Sequence[HookSpec]:
+    """Import the plugin of a node under a name of the node's own, and return its hooks in order.
 
-    One of an installed package (``module_name``) is imported anew, too, within its package; what it
-    imports itself is shared with the other nodes of the process. If it has a function ``hooks_of``,
-    its hooks are the functions that this returns for the description of ``node``.
+    A plugin whose hooks depend on the ports of its node has a function ``neuros_hooks(node)``. It
+    gets the node as its file declares it, and returns marked functions.
+
+    A module of an installed package is imported anew, too, within its package; what it
+    imports itself is shared with the other nodes of the process.
 
     Raises:
         PluginError: if it cannot be imported (with the traceback from the plugin on), or
             declares no hooks.
         HookError: if one of its hooks is declared wrongly.
     """
-    package, name = module_name.rpartition(".")[0], f"{PREFIX}{node_name}"
+    path, module_name = node.plugin, node.module
+    package, name = module_name.rpartition(".")[0], f"{PREFIX}{node.name}"
     if module_name and path == Path():
         raise no_module(module_name)
     full_name = f"{package}.{name}" if package else name
@@ -62,9 +63,9 @@ def load_plugin(
         if package:
             importlib.import_module(package)
         spec.loader.exec_module(module)
-        hooks: Mapping[Any, Any] = vars(module)
-        if node is not None and node.module and "hooks_of" in hooks:
-            hooks = dict(enumerate(hooks["hooks_of"](node)))
+        functions: Mapping[Any, Any] = vars(module)
+        if make := functions.get("neuros_hooks"):
+            functions = {**functions, **dict(enumerate(make(node)))}
     except NeurosError:
         raise
     except BaseException as error:
@@ -80,7 +81,7 @@ def load_plugin(
         ) from error
     finally:
         sys.setdlopenflags(flags)
-    specs = hook_specs_of(hooks)
+    specs = hook_specs_of(functions)
     if not specs:
         raise PluginError(
             f"{path}: declares no hooks: mark functions with @neuros_function or @neuros_tick"

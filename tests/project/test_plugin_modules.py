@@ -192,18 +192,18 @@ def test_a_container_of_neuros_cannot_have_it(tmp_path: Path) -> None:
 def test_a_module_can_make_its_hooks_from_the_description_of_the_node(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """``hooks_of``: a plugin for any ports."""
+    """``neuros_hooks``: a plugin for any ports."""
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab" / "__init__.py").write_text("")
     file = tmp_path / "lab" / "any_ports.py"
     file.write_text(
         "from neuros.hooks import neuros_function\n"
-        "def hooks_of(node):\n"
+        "def neuros_hooks(node):\n"
         "    names = [port.name for port in node.inputs]\n"
         "    return [neuros_function(inputs=names)(lambda node, *packets: None)]\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     ports = tuple(Port(name, "std_msgs/msg/Empty") for name in ("left", "right"))
     node = Node("any", "neuros_python", file, inputs=ports, module="lab.any_ports")
-    (spec,) = load_plugin(file, "any", "lab.any_ports", node)
+    (spec,) = load_plugin(node)
     assert [port.name for port in spec.inputs] == ["left", "right"]

@@ -16,10 +16,10 @@ from neuros.hooks import Optional, neuros_function, neuros_initialise, neuros_re
 from neuros.project.model import Node
 from neuros_robots.standard.serving import serve
 
-__all__ = ["hooks_of", "serve"]
+__all__ = ["neuros_hooks", "serve"]
 
 
-def hooks_of(node: Node) -> list[Callable[..., Any]]:
+def neuros_hooks(node: Node) -> list[Callable[..., Any]]:
     """The hooks of a node of this plugin: its ports are the inputs and outputs of ``step``."""
     from neuros_robots.standard.foreign import Foreign
     from neuros_robots.standard.lockstep import Lockstep
