@@ -17,6 +17,7 @@ import os
 import shutil
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from datetime import datetime, timezone
 from functools import cached_property
 from itertools import islice
 from operator import itemgetter
@@ -29,6 +30,7 @@ from rosbags.interfaces import Connection, QosDurability, QosReliability
 from rosbags.typesys import Stores, get_typestore
 
 from neuros.errors import EnvironmentFault, UsageError
+from neuros.project.timing import VIRTUAL
 from neuros.recording.bag_writer import BagWriter, define
 from neuros.recording.columns import LOG_TIME, PUBLISH_TIME, Column, columns_of
 from neuros.recording.recorder import lost_of, named, needs_repair, recorded_counts, repair
@@ -82,6 +84,11 @@ class RecordedTopic:
             p.durability is QosDurability.TRANSIENT_LOCAL for p in profiles
         )
         self.depth = max((p.depth for p in profiles), default=0) or 10
+
+    @property
+    def is_virtual(self) -> bool:
+        """Whether it is of a run in virtual time, whose packets have no wall time."""
+        return self._bag.custom.get("time") == VIRTUAL
 
     def raw(self) -> list[RawPacket]:
         """All packets, in the order of their wall time."""
@@ -149,9 +156,9 @@ class RecordedTopic:
     def array(self) -> npt.NDArray[Any]:
         """A structured array, one row per packet.
 
-        Its fields are ``log_time_ns`` (wall time), ``publish_time_ns`` (simulated time, where there
-        is one) and those of the message, with dots: ``header.stamp.sec``. Arrays keep their shape;
-        sequences of different length are objects.
+        Its fields are ``log_time_ns`` (wall time, or virtual time), ``publish_time_ns`` (simulated
+        time, where there is one) and those of the message, with dots: ``header.stamp.sec``. Arrays
+        keep their shape; sequences of different length are objects.
         """
         columns = self.columns()
         rows = len(columns[LOG_TIME])
@@ -164,8 +171,9 @@ class RecordedTopic:
         """A ``pandas.DataFrame``, one row per packet; arrays get a column for each element.
 
         Args:
-            clock: of the index ``time``: ``wall``, when packets were sent (UTC), or ``sim``, the
-                simulated time (a ``TimedeltaIndex``).
+            clock: of the index ``time``: ``wall``, when packets were sent (UTC; of a run in virtual
+                time, a ``TimedeltaIndex`` of that), or ``sim``, the simulated time (a
+                ``TimedeltaIndex``).
 
         Raises:
             UsageError: for the simulated time of a bag that has none, and without the extension
@@ -179,7 +187,8 @@ class RecordedTopic:
         Images of one size are ``(time, y, x, channel)``, those of one channel ``(time, y, x)``; the
         axes of other arrays have names like ``position_0``. The coordinate ``time`` is simulated
         time in seconds; where there is none, wall time since the first packet of the bag. The
-        coordinate ``wall_time`` is that of the wall clock (UTC). Variables whose unit the ROS
+        coordinate ``wall_time`` is that of the wall clock (UTC); a run in virtual time has
+        ``virtual_time`` in its place. Variables whose unit the ROS
         definition states have it as the attribute ``units``.
 
         Raises:
@@ -210,8 +219,11 @@ class RecordedTopic:
             UsageError: as :meth:`neo`.
             OSError: if the file cannot be written.
         """
-        run_id = self._bag.custom.get("run_id", "unknown")
-        BAG_FORMATS.load("nwb")(self, file, run_id, self._bag.start_ns)
+        custom, began_s = self._bag.custom, self._bag.start_ns / 1e9
+        began = datetime.fromtimestamp(began_s, timezone.utc)
+        if self.is_virtual:
+            began = datetime.strptime(custom["started"], "%Y-%m-%dT%H:%M:%S%z")
+        BAG_FORMATS.load("nwb")(self, file, custom.get("run_id", "unknown"), began)
 
 
 class Bag:
@@ -222,7 +234,8 @@ class Bag:
         topics: by name, in the order of the project.
         custom: metadata of the run: ``run_id``, ``project``, ``project_sha256``, ``versions``,
             ``seeds``.
-        start_ns: wall time of the first packet, in nanoseconds since 1970.
+        start_ns: wall time of the first packet, in nanoseconds since 1970; virtual time if the
+            run was in virtual time.
         duration_s: from the first packet to the last.
         missing: by topic, how many packets the bag has lost since the run ended.
         distribution: of ROS, as ``humble``, where the bag tells; empty where not.

@@ -136,8 +136,13 @@ class PacketRecorder(Protocol):
     def stream(self, way: Way, name: str) -> int | None:
         """The number of a stream: a port, or a connection; ``None`` if it is not recorded."""
 
-    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
+    def keep(
+        self, stream: int, data: bytes, sim_time_s: float | None, virtual_ns: int | None
+    ) -> None:
         """Keep a serialised packet, with the simulated time of a node that has one.
+
+        Args:
+            virtual_ns: when it was sent in virtual time; ``None``: the run is in real time.
 
         Raises ``OSError`` if neither this packet nor later ones can be kept.
         """

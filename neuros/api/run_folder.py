@@ -270,6 +270,7 @@ def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None
             "versions": json.dumps(versions),
             "seeds": json.dumps(seeded),
             "backend": plan.back_end.name,
+            "time": plan.project.time,
         },
     )
 

@@ -139,6 +139,7 @@ class NodeRecorder:
     Args:
         encode: serialises a packet.
         sim_time_s: the simulated time of the node, ``None`` where it owns none.
+        virtual_ns: nanoseconds of virtual time since time 0, ``None`` in real time.
 
     Attributes:
         failure: why nothing more is recorded, ``None`` while all is well.
@@ -149,11 +150,13 @@ class NodeRecorder:
         recorder: PacketRecorder,
         encode: Callable[[Any], bytes],
         sim_time_s: Callable[[], float | None],
+        virtual_ns: Callable[[], int | None],
         logger: Logger,
     ) -> None:
         self._recorder: PacketRecorder | None = recorder
         self._encode = encode
         self._sim_time_s = sim_time_s
+        self._virtual_ns = virtual_ns
         self._logger = logger
         self.failure: str | None = None
 
@@ -171,7 +174,8 @@ class NodeRecorder:
         if self._recorder is None:
             return
         try:
-            self._recorder.keep(stream, data or self._encode(packet), self._sim_time_s())
+            times = self._sim_time_s(), self._virtual_ns()
+            self._recorder.keep(stream, data or self._encode(packet), *times)
         except OSError as error:
             self.close()
             self.failure = f"its packets are not recorded to the end: {reason_of(error)}"

@@ -151,7 +151,11 @@ class NodeRuntime:
         instruments: list[Instrument] = [self.time, sampler]
         if recorder is not None:
             self._recorder = NodeRecorder(
-                recorder, middleware.packets.encode, lambda: self.time.now_s, self._logger
+                recorder,
+                middleware.packets.encode,
+                lambda: self.time.now_s,
+                wall_ns if self._virtual is not None else lambda: None,
+                self._logger,
             )
             instruments.append(self._recorder)
         self._on_initialised = on_initialised

@@ -1,5 +1,8 @@
 """Recorder: moves packets from the spools of a run into its bag, ordered by wall time.
 
+In virtual time, all times in spools and bag are virtual. Nodes do not come to a time together, and
+packets of a slow one are written late, with the simulated time of their own moment.
+
 The bag of a run that was cut off is repaired from its file and from the spools.
 """
 
@@ -12,9 +15,10 @@ import json
 import os
 import shutil
 import time
+from array import array
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from operator import itemgetter
 from pathlib import Path
 from queue import SimpleQueue
 from typing import TypeAlias
@@ -42,6 +46,7 @@ from neuros.recording.stored import StoredBag, faults_of, is_whole
 # Readers of bags sort, so a packet that comes later does no harm.
 _SPOOLING_NS = 20_000_000
 _MOST_BYTES = 8 << 20
+_MOST_HELD = 64 << 20  # bytes of packets that wait in virtual time for simulated time
 _ALL_NS = (1 << 63) - 1
 
 _Kept: TypeAlias = "tuple[int, int, tuple[int, ...], bytes, bool]"
@@ -96,8 +101,10 @@ class Recorder:
             for node, streams in plan.streams.items()
         ]
         self._held: list[_Kept] = []
+        self._written_ns = 0
         self._wall_clock = ForwardClock()
-        self._sim_ns = 0
+        # When the node that owns time has sent, and simulated time then; in real time the last one.
+        self._sent_ns, self._sim_ns = array("q", [-1]), array("q", [0])
         self._is_flushed = True
         self._due_s = self._clock() + plan.flush_interval
 
@@ -176,8 +183,11 @@ class Recorder:
             if topic not in self._plan.topics:  # a repair of the bag has to know it
                 self._plan = replace(self._plan, topics=(*self._plan.topics, topic))
                 self._plan.save(self._run)
-            self._held.append((wall_ns, NO_TIME, self._numbers([topic]), data, False))
-        self._held.sort(key=itemgetter(0))
+            time_ns = self._written_ns if self._plan.is_virtual else wall_ns
+            self._held.append((time_ns, NO_TIME, self._numbers([topic]), data, False))
+        self._held.sort(key=lambda kept: (kept[0], not kept[4]))
+        if self._plan.is_virtual and horizon_ns is not None:
+            horizon_ns = self._virtual_horizon_ns()
         written = 0
         for kept in self._held:
             if horizon_ns is not None and kept[0] > horizon_ns:
@@ -187,6 +197,12 @@ class Recorder:
         del self._held[:written]
         self._is_flushed = self._is_flushed and not written
         return has_more
+
+    def _virtual_horizon_ns(self) -> int:
+        """Up to when simulated time is known for each moment of virtual time."""
+        if self._plan.time_owner is None or sum(len(kept[3]) for kept in self._held) > _MOST_HELD:
+            return _ALL_NS
+        return max((kept[0] for kept in self._held if kept[4]), default=self._sent_ns[-1]) - 1
 
     def _read(self, source: _SpoolSource) -> tuple[list[SpoolRecord], bool]:
         """Records of a spool, and whether it has more; none once it has failed."""
@@ -222,12 +238,16 @@ class Recorder:
         self, wall_ns: int, sim_ns: int, topics: tuple[int, ...], data: bytes, owns_time: bool
     ) -> None:
         publish_ns = wall_ns
+        self._written_ns = max(self._written_ns, wall_ns)
         if sim_ns != NO_TIME:
             publish_ns = sim_ns
             if owns_time:
-                self._sim_ns = sim_ns
+                if not self._plan.is_virtual:
+                    del self._sent_ns[:], self._sim_ns[:]
+                self._sent_ns.append(wall_ns)
+                self._sim_ns.append(sim_ns)
         elif self._plan.time_owner is not None:
-            publish_ns = self._sim_ns
+            publish_ns = self._sim_ns[max(0, bisect_right(self._sent_ns, wall_ns) - 1)]
         for topic in topics:
             if self._is_new is None or self._is_new(topic, wall_ns):
                 self.bag.put(topic, wall_ns, publish_ns, data)

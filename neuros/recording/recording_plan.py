@@ -77,6 +77,7 @@ class RecordingPlan:
         time_owner: the one node that owns simulated time; ``None`` if none or several do.
         custom: for the metadata of the bag.
         flush_interval: seconds after which packets are on the disk.
+        is_virtual: whether the times of packets are virtual.
     """
 
     topics: tuple[Topic, ...]
@@ -86,6 +87,7 @@ class RecordingPlan:
     time_owner: str | None = None
     custom: Mapping[str, str] = field(default_factory=dict)
     flush_interval: float = 1.0
+    is_virtual: bool = False
 
     def save(self, run: Path) -> None:
         """Write the plan into the run folder. Raises ``OSError``."""
@@ -212,6 +214,7 @@ def plan_recording(
         time_owner=owners[0] if len(owners) == 1 else None,
         custom=custom,
         flush_interval=request.flush_interval,
+        is_virtual=project.is_virtual,
     )
 
 

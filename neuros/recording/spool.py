@@ -36,7 +36,11 @@ _SMALL_BYTES = 4096  # up to here a copy costs less than a write in two parts
 
 
 class SpoolRecord(NamedTuple):
-    """A packet in a spool; times in nanoseconds."""
+    """A packet in a spool; times in nanoseconds.
+
+    Attributes:
+        wall_ns: when it was sent, in virtual time for a run in virtual time.
+    """
 
     wall_ns: int
     sim_ns: int
@@ -83,16 +87,21 @@ class SpoolWriter:
         self._files = 0
         self._size = 0
         self._last_ns = 0
+        self._last_of_stream_ns: dict[int, int] = {}
 
     def stream(self, way: Way, name: str) -> int | None:
         """The number of a stream; ``None`` if its packets are not kept."""
         return self._numbers.get((way, name))
 
-    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
+    def keep(
+        self, stream: int, data: bytes, sim_time_s: float | None, virtual_ns: int | None
+    ) -> None:
         """Keep a packet. Raises ``OSError``; then it must not be called again."""
-        now_ns = self._clock()
-        # The time identifies a packet of the spool: no two packets have the same.
-        self._last_ns = now_ns = now_ns if now_ns > self._last_ns else self._last_ns + 1
+        now_ns = self._clock() if virtual_ns is None else virtual_ns
+        # The time identifies a packet of the stream: no two have the same.
+        last_ns = self._last_of_stream_ns.get(stream, -1)
+        now_ns = max(now_ns, self._last_ns, last_ns + 1)
+        self._last_ns = self._last_of_stream_ns[stream] = now_ns
         sim_ns = NO_TIME if sim_time_s is None else max(0, round(sim_time_s * 1e9))
         self.append(now_ns, sim_ns, stream, data)
 

@@ -9,12 +9,23 @@ import pytest
 from launching import EXAMPLES, launch
 
 import neuros
+import neuros.bag
 from neuros.api.run_record import PastRun, open_run
 from neuros.api.verify import RecordedPackets, compare
-from neuros.hooks import neuros_function
+from neuros.hooks import neuros_function, neuros_tick
 
+MS = 1_000_000
 WHISKEYE = EXAMPLES / "4_neurorobotics/whiskeye"
 DURATIONS = 'nodes.snn.durations.integrate={"normal":[0.045,0.005]}'
+
+
+@neuros_tick(seconds=0.01, outputs="x")
+def tick(node: Any) -> Any:
+    return node.make_packet("x")
+
+
+@neuros_function(inputs="x")
+def take(node: Any, x: Any) -> None: ...
 
 
 @neuros_function(inputs="x", outputs="y")
@@ -49,6 +60,30 @@ def test_nodes_in_processes_of_their_own_give_the_same_run(tmp_path: Path) -> No
     apart = run(tmp_path / "apart", "asynchronous", backend="process")
     found = compare(in_process, apart, RecordedPackets())
     assert (found.difference, found.remarks, found.not_compared) == (None, (), ())
+
+
+def test_a_recording_has_the_times_of_the_experiment_on_every_back_end(tmp_path: Path) -> None:
+    number = "std_msgs/msg/Int32"
+    a = neuros.Node("a", tick, outputs={"x": number})
+    durations = {"answer": 0.002}
+    b = neuros.Node("b", answer, inputs={"x": number}, outputs={"y": number}, durations=durations)
+    c = neuros.Node("c", take, inputs={"x": number})
+    connections = [
+        neuros.Connection(a["x"], b["x"], discard_limit=0, delay=0.001),
+        neuros.Connection(b["y"], c["x"], discard_limit=0),
+    ]
+    project = neuros.Project([a, b, c], connections, folder=tmp_path, time="virtual")
+    for backend in ("in-process", "process"):
+        folder = tmp_path / backend
+        project.run(backend=backend, duration=0.1, record=True, output=folder)
+        with neuros.bag.open(folder) as bag:
+            assert bag.custom["time"] == "virtual"
+            sent, answered = bag["a.x"], bag["b.y"]
+            assert [*sent.array()["log_time_ns"]] == [*range(10 * MS, 100 * MS, 10 * MS)]
+            assert [*answered.array()["publish_time_ns"]] == [*range(13 * MS, 100 * MS, 10 * MS)]
+            assert answered.frame().index[0].total_seconds() == 0.013
+            assert answered.xarray()["time"].attrs["long_name"] == "virtual time"
+            assert answered.xarray()["virtual_time"].dt.microseconds[0] == 13_000
 
 
 def test_a_ring_that_nothing_starts_is_a_deadlock_between_processes(tmp_path: Path) -> None:

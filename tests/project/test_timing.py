@@ -198,7 +198,8 @@ def test_an_input_from_outside_is_refused(tmp_path: Path) -> None:
     file = write(tmp_path, node("a"), b, first=first)
     load(file)
     (found,) = problems(file, time="virtual")
-    assert "packets of an external topic arrive in real time" in found
+    assert "/nodes/1/inputs/0/external_topic: packets of an external topic arrive in real" in found
+    assert "connect the input to a node, or run in real time" in found
 
 
 def test_an_unknown_clock_is_refused(tmp_path: Path) -> None:

@@ -68,6 +68,52 @@ def test_publish_time_is_simulated_time_where_a_node_owns_it(tmp_path: Path) -> 
     assert [times[ANSWER.name, wall_ns] for wall_ns in (5, 20, 40)] == [0, 500, 600]
 
 
+def test_in_virtual_time_packets_that_come_late_have_the_simulated_time_of_their_moment(
+    tmp_path: Path,
+) -> None:
+    what = replace(plan(time_owner="a"), is_virtual=True)
+    what.save(tmp_path)
+    recorder = Recorder(what, tmp_path, fail)
+    spool(tmp_path, "a", [(10, 500, number(1)), (30, 600, number(3)), (50, 700, number(5))])
+    while recorder.poll():
+        """Read what is there."""
+    spool(tmp_path, "b", [(5, None, answer()), (10, None, answer()), (40, None, answer())])
+    recorder.complete()
+    times = {(m.topic, m.log_ns): m.publish_ns for m in StoredBag(tmp_path / "bag").messages()}
+    assert [times[ANSWER.name, time_ns] for time_ns in (5, 10, 40)] == [0, 500, 600]
+
+
+def test_in_virtual_time_a_packet_waits_for_the_node_that_owns_simulated_time(
+    tmp_path: Path,
+) -> None:
+    what = replace(plan(time_owner="a", flush_interval=0.0), is_virtual=True)
+    what.save(tmp_path)
+    recorder = Recorder(what, tmp_path, fail)
+    spool(tmp_path, "b", [(20, None, answer())])
+    recorder.poll()
+    assert recorder.counts()[ANSWER.name] == 0
+    spool(tmp_path, "a", [(10, 500, number(1)), (30, 600, number(3))])
+    recorder.poll()
+    assert recorder.counts()[ANSWER.name] == 1
+    recorder.complete()
+    times = {m.topic: m.publish_ns for m in StoredBag(tmp_path / "bag").messages()}
+    assert times[ANSWER.name] == 500
+
+
+def test_in_virtual_time_a_packet_of_another_program_has_the_time_of_the_run(
+    tmp_path: Path,
+) -> None:
+    arrived: SimpleQueue[Arrived] = SimpleQueue()
+    what = replace(plan(), is_virtual=True)
+    what.save(tmp_path)
+    recorder = Recorder(what, tmp_path, fail, arrived=arrived)
+    spool(tmp_path, "a", [(10, None, number(1))])
+    recorder.poll()
+    arrived.put((Topic("/other", "std_msgs/msg/Int32"), time.time_ns(), number(2)))
+    recorder.complete()
+    assert {m.log_ns for m in StoredBag(tmp_path / "bag").messages()} == {10}
+
+
 def test_publish_time_is_wall_time_where_nobody_owns_time(tmp_path: Path) -> None:
     spool(tmp_path, "b", [(20, None, answer())])
     record(tmp_path, plan())

@@ -13,6 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from tests.load.running import busy_processes
 from tests.support.tables import update_rows
 
 from .running import BACKENDS, STRICT, VIRTUAL, Repeated, changing_load, differing, repeat
@@ -24,7 +25,8 @@ def main() -> int:
     """Run; returns the exit code."""
     options = _options()
     found: list[Repeated] = []
-    with changing_load(options.seed):
+    load = changing_load(options.seed) if options.busy is None else busy_processes(options.busy)
+    with load:
         for project in options.project or (VIRTUAL if options.time == "virtual" else STRICT):
             for backend in options.backend or BACKENDS:
                 with tempfile.TemporaryDirectory(prefix="neuros-reproducibility-") as name:
@@ -56,6 +58,7 @@ def _options() -> argparse.Namespace:
         "--project", action="append", choices=(*STRICT, *VIRTUAL), help="repeatable"
     )
     parser.add_argument("--time", choices=("real", "virtual"), default="real", help="(real)")
+    parser.add_argument("--busy", type=int, metavar="N", help="busy processes (0 to 3, changing)")
     parser.add_argument("--seed", type=int, default=1, help="of the load (1)")
     parser.add_argument("--table", type=Path, metavar="FILE", help="put the rows into its table")
     return parser.parse_args()

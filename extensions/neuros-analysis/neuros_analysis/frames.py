@@ -90,12 +90,14 @@ def frame(topic: RecordedTopic, clock: Literal["wall", "sim"]) -> Any:
         else:
             spread[name] = list(column)
     if clock == "sim":
-        if not has_simulated_time(columns):
+        if not (topic.is_virtual or has_simulated_time(columns)):
             raise UsageError(
                 f"{topic.name} has no simulated time: no node of the run owns time, or the bag"
                 ' is no MCAP file, and others have no place for it. Use clock="wall"'
             )
         time = pd.to_timedelta(columns[PUBLISH_TIME], unit="ns")
+    elif topic.is_virtual:
+        time = pd.to_timedelta(columns[LOG_TIME], unit="ns")
     else:
         time = pd.to_datetime(columns[LOG_TIME], unit="ns", utc=True)
     return pd.DataFrame(spread, index=time.rename("time"))
@@ -115,13 +117,18 @@ def dataset(topic: RecordedTopic, types: Mapping[str, Any], start_ns: int) -> An
     wall_ns, sim_ns = columns.pop(LOG_TIME), columns.pop(PUBLISH_TIME)
     if is_simulated:
         time_s, clock = sim_ns / 1e9, "simulated time"
+    elif topic.is_virtual:
+        time_s, clock = wall_ns / 1e9, "virtual time"
     else:
         time_s, clock = (wall_ns - start_ns) / 1e9, "wall time since the first packet of the bag"
     found = {".".join(name for _, name in way): way for way in fields_of(topic.type, types)}
     variables: dict[str, Any] = {}
     coordinates: dict[str, Any] = {
         "time": ("time", time_s, {"units": "s", "long_name": clock}),
-        "wall_time": ("time", wall_ns.astype("datetime64[ns]")),
+        "virtual_time" if topic.is_virtual else "wall_time": (
+            "time",
+            wall_ns.astype("timedelta64[ns]" if topic.is_virtual else "datetime64[ns]"),
+        ),
     }
     images = [name for name, way in found.items() if way[-1] == (IMAGE, "data")]
     for name in images:

@@ -293,8 +293,9 @@ def _panels(name: str, topic: RecordedTopic, start_ns: int) -> Iterator[dict[str
             yield {"output": name, "kind": "spikes", "size": size, "span": span, **data}
     elif topic.type in ARRAYS:
         columns = topic.columns()
-        clock = "publish_time_ns" if has_simulated_time(columns) else "log_time_ns"
-        begin_ns = 0 if has_simulated_time(columns) else start_ns
+        is_run_time = topic.is_virtual or has_simulated_time(columns)
+        clock = "publish_time_ns" if is_run_time else "log_time_ns"
+        begin_ns = 0 if is_run_time else start_ns
         stride = -(-topic.count // MOST_ARRAYS)
         arrays = columns[ARRAYS[topic.type]][::stride]
         rows = [np.asarray(row, "<f4")[:LONGEST_ARRAY] for row in arrays]

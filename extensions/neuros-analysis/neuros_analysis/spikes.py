@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from datetime import datetime, timezone
+from datetime import datetime
 from typing import Any
 
 import numpy as np
@@ -36,12 +36,11 @@ def segment(topic: RecordedTopic) -> Any:
 
 
 def write_nwb(
-    topic: RecordedTopic, file: str | os.PathLike[str], run_id: str, start_ns: int
+    topic: RecordedTopic, file: str | os.PathLike[str], run_id: str, began: datetime
 ) -> None:
     """The work of :meth:`RecordedTopic.nwb`."""
     pynwb = library("pynwb", "neo()")
     trains = trains_of(topic)
-    began = datetime.fromtimestamp(start_ns / 1e9, timezone.utc)
     content = pynwb.NWBFile(f"simulated spikes of {topic.name}", run_id, began)
     span = [(trains.start_s, trains.end_s)]
     for neuron, times_s in enumerate(trains.times_s):

@@ -128,7 +128,9 @@ def test_without_simulated_time_seconds_count_from_the_first_packet_of_the_bag(
 
 def test_a_field_with_the_name_of_a_coordinate_keeps_its_values() -> None:
     columns = {name: np.array([5]) for name in ("log_time_ns", "publish_time_ns", "time")}
-    topic = SimpleNamespace(name="/t", type="lab/msg/Lap", connection=None, columns=lambda: columns)
+    topic = SimpleNamespace(
+        name="/t", type="lab/msg/Lap", connection=None, columns=lambda: columns, is_virtual=False
+    )
     made = frames.dataset(topic, {"lab/msg/Lap": ([], [("time", (None, ("int64", 0)))])}, 5)
     assert (made["time"].item(), made["time_"].item()) == (0.0, 5)
 

@@ -96,7 +96,9 @@ class Comparison:
         """The number of a stream; ``None`` if the run has not recorded it."""
         return self._numbers.get((way, name))
 
-    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
+    def keep(
+        self, stream: int, data: bytes, sim_time_s: float | None, virtual_ns: int | None
+    ) -> None:
         """Compare a packet that the replay sends."""
         if self.difference is not None:
             return
