@@ -125,7 +125,7 @@ class LocalRun:
         )
         atexit.register(self._end_with_program)
         try:
-            with self._thread.until():
+            with self._thread:
                 self._load()
                 self._loop.run_until_idle()
         except BaseException as error:
@@ -156,7 +156,7 @@ class LocalRun:
         if self._run is not None:
             return None
         nodes = self._nodes.values()
-        with self._thread.until(end_s):
+        with self._thread if end_s is None else self._thread.until(end_s):
             if self._sent:
                 self._deliver_sent()
             if self._is_behind or not rounds:
@@ -183,7 +183,7 @@ class LocalRun:
         if self._run is not None:
             return None
         began_s = time.monotonic()
-        with self._thread.until():
+        with self._thread:
             self._deliver_sent()
             self._is_behind = True
             for node in self._nodes.values():
@@ -217,7 +217,7 @@ class LocalRun:
         """Change environments and parameters; see :meth:`HeldRun.change`."""
         if self._run is not None:
             return None
-        with self._thread.until():
+        with self._thread:
             for name, (variables, parameters) in changes.items():
                 self._nodes[name].change(variables, parameters, only_checks=only_checks)
         return self._rest({})
@@ -236,7 +236,7 @@ class LocalRun:
         is_fixed = self._thread.has_threads or any(node.why_not_reset for node in nodes)
         if self._run is not None or is_fixed:
             return False
-        with self._thread.until():
+        with self._thread:
             self._sent.clear()
             self._histories.clear()
             for node in nodes:
@@ -468,7 +468,7 @@ class LocalRun:
                 except KeyboardInterrupt as error:
                     interruption = error
                     outcome.fail("ended by Ctrl+C", EXIT_CODES[signal.SIGINT])
-            with self._thread.until():
+            with self._thread:
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
                     node.reports.write_logs()
@@ -488,7 +488,7 @@ class LocalRun:
         last_round = self._declarations.last_round(stopped)
         try:
             is_virtual = self._plan.project.is_virtual
-            with self._thread.until(None if is_virtual else time.monotonic() + drain_s):
+            with self._thread if is_virtual else self._thread.until(time.monotonic() + drain_s):
                 for node in self._nodes.values():
                     node.drain(last_round.get(node.name, ()))
                 self._loop.run_until_idle()
@@ -600,15 +600,15 @@ class _Thread:
                 " at it"
             )
 
-    def until(self, end_s: float | None = None) -> _Thread:
+    def until(self, end_s: float) -> _Thread:
         """The thread for nodes; they are interrupted at a time (monotonic, seconds)."""
-        if self._is_inside:
-            self.check_outside()
-        if end_s is not None:
+        if not self._is_inside:
             self._watchdog = _Watchdog(end_s, self._loop, self._describe_hang)
         return self
 
     def __enter__(self) -> None:
+        if self._is_inside:
+            self.check_outside()
         watchdog = self._watchdog
         if watchdog is None:
             self.turn.acquire()
@@ -621,7 +621,7 @@ class _Thread:
             if time.monotonic() - self._left_s > _CELL_S:
                 self._handle_interrupts()
             self._is_inside = True
-            if threading.get_ident() == _MAIN.ident:
+            if threading.get_ident() == _MAIN:
                 self._is_interruptible = True
                 self._interruptible.append(self._loop)
             os.fchdir(self._folder)
@@ -714,11 +714,11 @@ def _handler() -> object:
     return signal.getsignal(signal.SIGINT)
 
 
-_MAIN = threading.main_thread()
+_MAIN = threading.main_thread().ident
 
 
 def _is_main() -> bool:
-    return threading.get_ident() == _MAIN.ident
+    return threading.get_ident() == _MAIN
 
 
 class _Watchdog:

@@ -458,8 +458,8 @@ class Engine:
                 result: Any = hook.consume()
             else:
                 arguments = []
-                for hook_input in hook.inputs:
-                    arguments.append(hook_input.consume(start_ns))
+                for consume in hook.consumers:
+                    arguments.append(consume(start_ns))
                 result = self._effects.call(hook, arguments)
         finally:
             self.executing = None
