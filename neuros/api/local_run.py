@@ -616,7 +616,12 @@ class _Thread:
             self._watchdog = None
             raise TimeoutError("a hook of another session has not returned in time")
         try:
-            self._note_folder()
+            try:
+                path = os.getcwd()
+            except FileNotFoundError:  # it has been removed
+                path = ""
+            if path != self._program_path or not path:
+                self._note_folder(path)
             # A notebook exchanges the handler with each cell, so it is looked at after a pause.
             if time.monotonic() - self._left_s > _CELL_S:
                 self._handle_interrupts()
@@ -678,16 +683,11 @@ class _Thread:
         self._is_inside = False
         self.turn.release()
 
-    def _note_folder(self) -> None:
-        try:
-            path = os.getcwd()
-        except FileNotFoundError:  # it has been removed
-            path = ""
-        if path != self._program_path or not path:
-            if self._program_folder >= 0:
-                os.close(self._program_folder)
-            self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
-            self._program_path = path
+    def _note_folder(self, path: str) -> None:
+        if self._program_folder >= 0:
+            os.close(self._program_folder)
+        self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
+        self._program_path = path
 
     def _handle_interrupts(self) -> None:
         if _is_main() and _handler() is signal.default_int_handler:

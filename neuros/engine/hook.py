@@ -186,7 +186,7 @@ class Hook:
             if result is not None:
                 raise self.error(f"returned {_kind(result)}, but declares no outputs")
             return ()
-        elif result is None:
+        if result is None:
             packets = (None,) * len(results)
         else:
             packets = result if isinstance(result, _SEVERAL) else (result,)

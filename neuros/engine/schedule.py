@@ -332,8 +332,9 @@ class Pause:
             self._still_since_ns = now_ns
         return PAUSED
 
-    def _end_standstill(self, *times_ns: int) -> None:
+    def _end_standstill(self, since_ns: int, now_ns: int) -> None:
         """End the time in which the node stands still."""
+        times_ns = since_ns, now_ns
         self.last_still_ns.append(times_ns)
         self.still_ns.extend(times_ns)
         self._still_since_ns = None
