@@ -131,7 +131,7 @@ class LocalRun:
         except BaseException as error:
             self.interrupt(*why_it_ended(error))
             raise
-        if self._failed_or_over():
+        if self._end is not None or self._outcome.failures:
             self._finish()
 
     # ------------------------------------------------------------------ steps
@@ -436,9 +436,6 @@ class LocalRun:
     def _fail_in_callback(self, error: BaseException) -> None:
         name = self._files[0].node.name
         self._fail(name, error if isinstance(error, NeurosError) else callback_error(error))
-
-    def _failed_or_over(self) -> bool:
-        return self._end is not None or bool(self._outcome.failures)
 
     def _write(self, name: str, record: Record) -> None:
         """Write a record into the log of its node, and pass it on to Python's ``logging``."""

@@ -201,8 +201,8 @@ class JointStates(Sensor):
                 text = f"joint '{names[index]}' is neither a hinge nor a slide"
                 problems.add(f"{self.declared.pointer}/element", text)
         self._names = [names[index] for index in joints]
-        self._positions = _place(self.model.jnt_qposadr[joints])
-        self._speeds = _place(self.model.jnt_dofadr[joints])
+        self._positions = self.model.jnt_qposadr[joints]
+        self._speeds = self.model.jnt_dofadr[joints]
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         set_stamp(packet.header.stamp, time_ns)
@@ -210,13 +210,6 @@ class JointStates(Sensor):
         packet.position = array("d", data.qpos[self._positions].tobytes())
         packet.velocity = array("d", data.qvel[self._speeds].tobytes())
         packet.effort = array("d", data.qfrc_actuator[self._speeds].tobytes())
-
-
-def _place(numbers: Any) -> Any:
-    """Numbers that index an array; a slice if they follow each other, which is faster."""
-    first, count = int(numbers[0]) if len(numbers) else 0, len(numbers)
-    is_row = numbers.tolist() == [*range(first, first + count)]
-    return slice(first, first + count) if is_row else numbers
 
 
 class Contacts(Sensor):
