@@ -125,13 +125,13 @@ class LocalRun:
         )
         atexit.register(self._end_with_program)
         try:
-            with self._thread.until():
+            with self._thread:
                 self._load()
                 self._loop.run_until_idle()
         except BaseException as error:
             self.interrupt(*why_it_ended(error))
             raise
-        if self._failed_or_over():
+        if self._end is not None or self._outcome.failures:
             self._finish()
 
     # ------------------------------------------------------------------ steps
@@ -156,7 +156,7 @@ class LocalRun:
         if self._run is not None:
             return None
         nodes = self._nodes.values()
-        with self._thread.until(end_s):
+        with self._thread if end_s is None else self._thread.until(end_s):
             if self._sent:
                 self._deliver_sent()
             if self._is_behind or not rounds:
@@ -183,7 +183,7 @@ class LocalRun:
         if self._run is not None:
             return None
         began_s = time.monotonic()
-        with self._thread.until():
+        with self._thread:
             self._deliver_sent()
             self._is_behind = True
             for node in self._nodes.values():
@@ -217,7 +217,7 @@ class LocalRun:
         """Change environments and parameters; see :meth:`HeldRun.change`."""
         if self._run is not None:
             return None
-        with self._thread.until():
+        with self._thread:
             for name, (variables, parameters) in changes.items():
                 self._nodes[name].change(variables, parameters, only_checks=only_checks)
         return self._rest({})
@@ -236,7 +236,7 @@ class LocalRun:
         is_fixed = self._thread.has_threads or any(node.why_not_reset for node in nodes)
         if self._run is not None or is_fixed:
             return False
-        with self._thread.until():
+        with self._thread:
             self._sent.clear()
             self._histories.clear()
             for node in nodes:
@@ -437,9 +437,6 @@ class LocalRun:
         name = self._files[0].node.name
         self._fail(name, error if isinstance(error, NeurosError) else callback_error(error))
 
-    def _failed_or_over(self) -> bool:
-        return self._end is not None or bool(self._outcome.failures)
-
     def _write(self, name: str, record: Record) -> None:
         """Write a record into the log of its node, and pass it on to Python's ``logging``."""
         node = name.partition(".")[0]
@@ -468,7 +465,7 @@ class LocalRun:
                 except KeyboardInterrupt as error:
                     interruption = error
                     outcome.fail("ended by Ctrl+C", EXIT_CODES[signal.SIGINT])
-            with self._thread.until():
+            with self._thread:
                 for node in self._nodes.values():
                     node.finalise(runs_hooks=self._has_begun)
                     node.reports.write_logs()
@@ -488,7 +485,7 @@ class LocalRun:
         last_round = self._declarations.last_round(stopped)
         try:
             is_virtual = self._plan.project.is_virtual
-            with self._thread.until(None if is_virtual else time.monotonic() + drain_s):
+            with self._thread if is_virtual else self._thread.until(time.monotonic() + drain_s):
                 for node in self._nodes.values():
                     node.drain(last_round.get(node.name, ()))
                 self._loop.run_until_idle()
@@ -600,15 +597,15 @@ class _Thread:
                 " at it"
             )
 
-    def until(self, end_s: float | None = None) -> _Thread:
+    def until(self, end_s: float) -> _Thread:
         """The thread for nodes; they are interrupted at a time (monotonic, seconds)."""
-        if self._is_inside:
-            self.check_outside()
-        if end_s is not None:
+        if not self._is_inside:
             self._watchdog = _Watchdog(end_s, self._loop, self._describe_hang)
         return self
 
     def __enter__(self) -> None:
+        if self._is_inside:
+            self.check_outside()
         watchdog = self._watchdog
         if watchdog is None:
             self.turn.acquire()
@@ -616,12 +613,17 @@ class _Thread:
             self._watchdog = None
             raise TimeoutError("a hook of another session has not returned in time")
         try:
-            self._note_folder()
+            try:
+                path = os.getcwd()
+            except FileNotFoundError:  # it has been removed
+                path = ""
+            if path != self._program_path or not path:
+                self._note_folder(path)
             # A notebook exchanges the handler with each cell, so it is looked at after a pause.
             if time.monotonic() - self._left_s > _CELL_S:
                 self._handle_interrupts()
             self._is_inside = True
-            if threading.get_ident() == _MAIN.ident:
+            if threading.get_ident() == _MAIN:
                 self._is_interruptible = True
                 self._interruptible.append(self._loop)
             os.fchdir(self._folder)
@@ -678,16 +680,11 @@ class _Thread:
         self._is_inside = False
         self.turn.release()
 
-    def _note_folder(self) -> None:
-        try:
-            path = os.getcwd()
-        except FileNotFoundError:  # it has been removed
-            path = ""
-        if path != self._program_path or not path:
-            if self._program_folder >= 0:
-                os.close(self._program_folder)
-            self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
-            self._program_path = path
+    def _note_folder(self, path: str) -> None:
+        if self._program_folder >= 0:
+            os.close(self._program_folder)
+        self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
+        self._program_path = path
 
     def _handle_interrupts(self) -> None:
         if _is_main() and _handler() is signal.default_int_handler:
@@ -714,11 +711,11 @@ def _handler() -> object:
     return signal.getsignal(signal.SIGINT)
 
 
-_MAIN = threading.main_thread()
+_MAIN = threading.main_thread().ident
 
 
 def _is_main() -> bool:
-    return threading.get_ident() == _MAIN.ident
+    return threading.get_ident() == _MAIN
 
 
 class _Watchdog:

@@ -18,6 +18,7 @@ from __future__ import annotations
 from array import array
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Protocol
 
 from neuros.engine.metrics import Rest, State
@@ -418,8 +419,14 @@ class HookInput:
         """Whether a start of the hook would consume a packet of ``queue``."""
         return bool(queue.packets) and (self.is_all or self.chosen() is queue)
 
+    def consumer(self) -> Callable[[int], Any]:
+        """The function that returns the argument for a start of the hook; see :meth:`consume`."""
+        if len(self.queues) != 1 or self.is_all:
+            return self.consume
+        return partial(self.queues[0].subscription.consume, self.queues[0])
+
     def consume(self, now_ns: int) -> Any:
-        """The argument for the hook, which starts."""
+        """The argument for the hook, which starts at a time, and so consumes the packets in it."""
         if self.is_all:
             return [queue.subscription.consume(queue, now_ns) for queue in self.queues]
         queue = self.queues[0] if len(self.queues) == 1 else self.chosen()

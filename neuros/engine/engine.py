@@ -75,6 +75,7 @@ class Engine:
         spent_ns: wall time by cause; each hook counts its own executions.
         execution_log: the first executions.
         sim_clock: simulated time, as far as the node knows it.
+        pauses: the pause of the node, with its times.
         event_log: its events, where they are recorded (:mod:`neuros.engine.event_log`).
 
     Raises:
@@ -114,7 +115,7 @@ class Engine:
         self._lifecycle = Lifecycle(self._schedule, self.send_windows, clock)
         self._sources: dict[tuple[str, ...], Source] = {}
         self._ticks = [h for h in self.all_hooks if h.spec.kind is HookKind.TICK]
-        self._pause = Pause(self._lifecycle, self._ticks)
+        self.pauses = Pause(self._lifecycle, self._ticks)
         self.is_driving = any(hook.drives for hook in self.all_hooks)
         self._has_posted_loop_back = False
         self._is_passing = False
@@ -150,7 +151,7 @@ class Engine:
         self._wake()
         self._arrivals += 1
         self.subscriptions[key].put(self._arrivals, packet)
-        if not self._pause.is_still:
+        if not self.pauses.is_still:
             self._pass()
 
     def on_acknowledgement(
@@ -165,7 +166,7 @@ class Engine:
         self.send_windows[connection].credit(position, now_ns)
         if not self.execution_log.is_full:
             self.execution_log.record_credit(connection, position, now_ns)
-        if self._schedule.candidates and not self._pause.is_still:  # else no pass finds more
+        if self._schedule.candidates and not self.pauses.is_still:  # else no pass finds more
             self._pass()
 
     def on_registered(self, connection: Connection) -> None:
@@ -220,8 +221,8 @@ class Engine:
         self._wake()
         self._lifecycle.drain(self.all_hooks[place] for place in last_round)
         self._cause = self.rest()
-        if self._pause.is_on:
-            self._pause.end(self._wake())
+        if self.pauses.is_on:
+            self.pauses.end(self._wake())
             self._pass()
 
     def pause(self) -> None:
@@ -230,11 +231,11 @@ class Engine:
         A second pause revokes the steps that are left. A pause of a draining node has no effect.
         """
         if self._cause is PAUSED:
-            self._pause.revoke()
+            self.pauses.revoke()
             return
         now_ns = self._wake()
         if not self._lifecycle.is_draining:
-            self._pause.begin(now_ns)
+            self.pauses.begin(now_ns)
         self._cause = self.rest()
 
     def resume(self) -> None:
@@ -243,8 +244,8 @@ class Engine:
         Hooks start with the next event: one that started now would hold the pause of the other
         nodes in the thread.
         """
-        if self._pause.is_on:
-            self._pause.end(self._wake())
+        if self.pauses.is_on:
+            self.pauses.end(self._wake())
             self._cause = self.rest()
             if self._cause is SCHEDULING and not self._has_posted_loop_back:
                 self._has_posted_loop_back = True
@@ -258,7 +259,7 @@ class Engine:
         :class:`~neuros.engine.schedule.Pause`.
         """
         self._wake()
-        self._pause.grant(count, self._arrivals, is_driven=is_driven)
+        self.pauses.grant(count, self._arrivals, is_driven=is_driven)
         self._pass()
 
     def reading(self, value: int) -> int:
@@ -297,12 +298,7 @@ class Engine:
     @property
     def is_paused(self) -> bool:
         """Whether hooks start in steps only."""
-        return self._pause.is_on
-
-    @property
-    def pauses(self) -> Pause:
-        """The pause of the node, with its times."""
-        return self._pause
+        return self.pauses.is_on
 
     @property
     def tick_start_ns(self) -> int:
@@ -312,7 +308,7 @@ class Engine:
     @property
     def next_due_ns(self) -> int | None:
         """The time of the next :meth:`on_timer`, on the clock of the engine; ``None``: never."""
-        if self._pause.is_on:
+        if self.pauses.is_on:
             return None
         return min(
             (hook.due_ns for hook in self._ticks if hook.is_enabled and not hook.is_due),
@@ -367,7 +363,7 @@ class Engine:
         lifecycle = self._lifecycle
         if not lifecycle.has_begun or (not lifecycle.is_active and lifecycle.awaits_others):
             return REGISTERING
-        if self._pause.is_on:
+        if self.pauses.is_on:
             return PAUSED
         cause = self._schedule.rest()
         return IDLE if self.is_stopped and cause is SCHEDULING else cause
@@ -377,7 +373,7 @@ class Engine:
     def _wake(self) -> int:
         """Count the time since the last event, and mark the due ticks; returns the time."""
         now_ns = self._clock()
-        if self._ticks and not self._pause.is_on:
+        if self._ticks and not self.pauses.is_on:
             for hook in self._ticks:
                 if hook.is_enabled and not hook.is_due and hook.due_ns <= now_ns:
                     hook.is_due = True
@@ -395,7 +391,7 @@ class Engine:
         """
         if self._is_passing:  # hooks never nest, even if one spins: the loop-back continues
             return
-        lifecycle, pause, candidates = self._lifecycle, self._pause, self._schedule.candidates
+        lifecycle, pause, candidates = self._lifecycle, self.pauses, self._schedule.candidates
         if not lifecycle.has_begun:
             return
         if pause.is_on and self._ticks:
@@ -443,8 +439,8 @@ class Engine:
         """Run a hook: move it to the end of the order, consume its inputs, send its packets."""
         self._schedule.move_to_end(hook)
         start_ns = self._clock()
-        if self._pause.is_on:
-            self._pause.record_start(hook, start_ns, self._arrivals)
+        if self.pauses.is_on:
+            self.pauses.record_start(hook, start_ns, self._arrivals)
         elif hook.ticks is not None:
             hook.ticks.record(start_ns)
             hook.set_due(self._lifecycle.tick_start_ns, start_ns)
@@ -458,8 +454,8 @@ class Engine:
                 result: Any = hook.consume()
             else:
                 arguments = []
-                for hook_input in hook.inputs:
-                    arguments.append(hook_input.consume(start_ns))
+                for consume in hook.consumers:
+                    arguments.append(consume(start_ns))
                 result = self._effects.call(hook, arguments)
         finally:
             self.executing = None
@@ -485,8 +481,8 @@ class Engine:
                 for queue in hook_input.queues:
                     queue.subscription.remove(queue)
             self._lifecycle.finish_initialiser(hook)
-            if self._pause.is_on:
-                self._pause.wake_ticks()
+            if self.pauses.is_on:
+                self.pauses.wake_ticks()
 
     def _send_to_itself(self, connection: Connection, packet: Any) -> None:
         own = self._effects.copy_to_itself(connection, packet)

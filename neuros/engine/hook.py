@@ -27,6 +27,7 @@ class Hook:
             hook and its inputs add and remove it.
         is_open: whether it is enabled and due.
         lacking: the number of inputs that lack a packet.
+        consumers: by input, what returns the argument for a start.
         drives: whether it starts again and again without a packet: a tick, or a main loop.
         executions: their number.
         busy_ns: their duration in all.
@@ -37,10 +38,12 @@ class Hook:
         "_is_due",
         "_is_enabled",
         "_results",
+        "_single",
         "_windows",
         "blocked",
         "busy_ns",
         "candidates",
+        "consumers",
         "drives",
         "due_ns",
         "executions",
@@ -63,9 +66,13 @@ class Hook:
         self.spec = spec
         self.name = spec.name
         self.inputs = tuple(inputs)
+        self.consumers = tuple(each.consumer() for each in inputs)
         self.outputs = tuple(outputs[port.name] for port in spec.outputs)
         self._windows = tuple(window for output in self.outputs for window in output.windows)
         self._results = tuple((outputs[port.name], port.is_optional) for port in spec.outputs)
+        # The output and its type, of a hook with one.
+        types = tuple((o, o.packet_type) for o in self.outputs if o.packet_type is not None)
+        self._single = types[0] if len(types) == len(self.outputs) == 1 else None
         is_main_loop = all(port.is_optional for port in spec.inputs)
         self.drives = spec.kind is HookKind.TICK or (
             spec.kind is HookKind.FUNCTION and is_main_loop
@@ -168,13 +175,18 @@ class Hook:
             HookError: if the count, a type or a value is wrong, or a required packet is missing.
         """
         results = self._results
-        if len(results) == 1 and result is not None and not isinstance(result, _SEVERAL):
-            packets: Sequence[Any] = (result,)  # the result of most hooks
-        elif not results:
+        single = self._single
+        if single is not None and isinstance(result, single[1].kind):  # the result of most hooks
+            try:
+                return ((single[0], single[1].check(result)),)
+            except WrongValue as error:
+                raise self._wrong_value(single[0], error) from None
+        packets: Sequence[Any]
+        if not results:
             if result is not None:
                 raise self.error(f"returned {_kind(result)}, but declares no outputs")
             return ()
-        elif result is None:
+        if result is None:
             packets = (None,) * len(results)
         else:
             packets = result if isinstance(result, _SEVERAL) else (result,)
@@ -204,13 +216,15 @@ class Hook:
             try:
                 found.append((output, wanted.check(packet)))
             except WrongValue as error:
-                text = f"packet for output '{output.port.name}': {error}"
-                raise self.error(text) from None
+                raise self._wrong_value(output, error) from None
         return found
 
     def error(self, text: str) -> HookError:
         """A ``HookError`` with the name and line of this hook."""
         return HookError(text, hook=self.name, where=self.spec.where)
+
+    def _wrong_value(self, output: Output, error: WrongValue) -> HookError:
+        return self.error(f"packet for output '{output.port.name}': {error}")
 
     def _no_packet(self, output: Output, found: object) -> HookError:
         """The error for something that is no packet of an output."""

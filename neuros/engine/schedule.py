@@ -286,7 +286,8 @@ class Pause:
         if not self.is_on:
             return
         self.is_on = self.is_still = False
-        self._end_standstill(now_ns)
+        if self._still_since_ns is not None:
+            self._end_standstill(self._still_since_ns, now_ns)
         if not self._lifecycle.is_running:
             return
         paused_ns = now_ns - max(self._since_ns, self._lifecycle.tick_start_ns)
@@ -331,17 +332,17 @@ class Pause:
             self._still_since_ns = now_ns
         return PAUSED
 
-    def _end_standstill(self, now_ns: int) -> None:
+    def _end_standstill(self, since_ns: int, now_ns: int) -> None:
         """End the time in which the node stands still."""
-        if self._still_since_ns is not None:
-            self.last_still_ns.append((self._still_since_ns, now_ns))
-            self.still_ns.extend((self._still_since_ns, now_ns))
-            self._still_since_ns = None
+        times_ns = since_ns, now_ns
+        self.last_still_ns.append(times_ns)
+        self.still_ns.extend(times_ns)
+        self._still_since_ns = None
 
     def record_start(self, hook: Hook, now_ns: int, arrivals: int) -> None:
         """Count the start of a hook in the pause; ``arrivals`` as of :meth:`grant`."""
-        if self._still_since_ns is not None:
-            self._end_standstill(now_ns)
+        if (since_ns := self._still_since_ns) is not None:
+            self._end_standstill(since_ns, now_ns)
         started = self._started[hook] = self._started.get(hook, 0) + 1
         if hook.drives:
             self._arrived = arrivals

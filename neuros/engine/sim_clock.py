@@ -109,6 +109,9 @@ class TickInput(HookInput):
     def on_discarded(self) -> None:
         self._skip_early(self._clock())
 
+    def consumer(self) -> Callable[[int], Any]:
+        return self.consume
+
     def consume(self, now_ns: int) -> Any:
         packet = super().consume(now_ns)
         time_ns = to_nanoseconds(packet)

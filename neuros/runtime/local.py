@@ -134,18 +134,18 @@ class LocalLoop:
         """
         events, from_threads = self._events, self._from_threads
         while not self._is_stopping:
-            if not from_threads.empty():
+            if not from_threads.empty():  # an interruption comes with an event, too
+                if self.interruption is not None:
+                    self._raise_interruption()
                 events.append(from_threads.get())
-            elif not events:
-                if self.ros is None:
-                    return
+            elif events:
+                events.popleft()()
+            elif self.ros is None:
+                return
+            else:
                 self.ros.run_until_idle()
                 if not events and from_threads.empty():
                     return
-            if self.interruption is not None:
-                self._raise_interruption()
-            if events:
-                events.popleft()()
 
     def run_for(self, seconds: float) -> None:
         """Handle events, timers and ROS for a time on the wall clock, or until :meth:`end_run`.

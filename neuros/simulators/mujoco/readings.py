@@ -122,7 +122,8 @@ class Reading(Sensor):
             )
 
     def fill_array(self, packet: Packet, data: Any) -> None:
-        _fill_rows(packet, [data.sensordata[place] for place in self._places])
+        parts = [data.sensordata[place] for place in self._places]
+        np.concatenate(parts, out=packet.reshape(-1), casting="same_kind")
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         if self._form is None:
@@ -199,7 +200,7 @@ class Data(Sensor):
         self._time[0] = data.time
         if self._is_after_constraint:
             compute_forces(self.model, data)
-        _fill_rows(packet, self._parts)
+        np.concatenate(self._parts, out=packet.reshape(-1), casting="same_kind")
 
     def _parts_of(self, data: Any) -> list[Any]:
         """Views of the arrays."""
@@ -238,11 +239,6 @@ def no_field(name: str) -> str:
     match = _SLICE.fullmatch(name)
     hint = did_you_mean(match[1] if match else name, (*STATE, *_COMPUTED))
     return f"'{name}' is neither an array of mjData nor a part of one, as 'qpos[2:]'{hint}"
-
-
-def _fill_rows(packet: Packet, parts: list[Any]) -> None:
-    """Fill an array with numbers, row by row."""
-    np.concatenate(parts, out=packet.reshape(-1), casting="same_kind")
 
 
 class Transforms(Sensor):

@@ -206,7 +206,7 @@ class JointStates(Sensor):
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         set_stamp(packet.header.stamp, time_ns)
-        packet.name = list(self._names)
+        packet.name = self._names.copy()
         packet.position = array("d", data.qpos[self._positions].tobytes())
         packet.velocity = array("d", data.qvel[self._speeds].tobytes())
         packet.effort = array("d", data.qfrc_actuator[self._speeds].tobytes())

@@ -75,7 +75,7 @@ class MuJoCo:
             )
         self._is_over = self._is_shared = False
         world = self._world
-        node.own_simulated_time(lambda: world.time.seconds(world.steps))
+        node.own_simulated_time(lambda: world.time_s)
         node.show_world(self._view.observe)
         node.on_close(self.close)
         node.on_change(self._change_fields, self._world.check_fields)
@@ -118,19 +118,21 @@ class MuJoCo:
         """
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
             raise ModelError(f"step_synchronous: count is a whole number from 1, not {count!r}")
-        self._step_to(self._world.steps + count)
+        self._step_to(self._world.steps + count, may_cross=True)
 
     def step_to_next(self) -> None:
         """Advance to the next firing of any sensor."""
         target = self._world.schedule.next_firing(self._world.steps)
         if target is None:
             raise ModelError(f"{self._node.description.file}: no output has a sensor to step to")
-        self._step_to(target)
+        self._step_to(target, may_cross=bool(self._unread))
 
-    def _step_to(self, target: int) -> None:
+    def _step_to(self, target: int, *, may_cross: bool) -> None:
         world = self._world
-        self._refuse_while_running("step_synchronous")
-        world.require_bound()
+        if self._run is not None:
+            self._refuse_while_running("step_synchronous")
+        if not world.bound.is_complete:
+            world.require_bound()
         # While the plugin waits here, only others can resume: in the viewer, or from a thread.
         has_viewer = self._viewer is not None and self._viewer.is_open
         if self._lock.is_paused and not (has_viewer or self._is_shared):
@@ -138,7 +140,8 @@ class MuJoCo:
         while not self._is_over and self._lock.is_paused and not self._is_shared:
             self._sync_viewer()
             self._lock.wait_resumed(_IDLE_S)
-        if crossing := world.schedule.find_crossing(self._unread, world.steps, target):
+        crossing = may_cross and world.schedule.find_crossing(self._unread, world.steps, target)
+        if crossing:
             output, first, second = crossing
             when = world.time.seconds
             raise ModelError(
@@ -146,8 +149,9 @@ class MuJoCo:
                 f"{when(second):g} s while its packet of {when(first):g} s is unread: call "
                 f"read('{output}') after each firing, every {second - first} steps"
             )
-        if self._node.virtual_time is not None:
-            self._node.virtual_time.will_step_to(world.time.seconds(target))
+        virtual_time = self._node.virtual_time
+        if virtual_time is not None:
+            virtual_time.will_step_to(world.time.seconds(target))
         if self._is_shared:
             self._advance_shared(target)
         else:
@@ -170,12 +174,15 @@ class MuJoCo:
 
     def read(self, output: str) -> Packet | None:
         """The packet of the sensor behind ``output`` that has come due since the last read."""
-        self._refuse_while_running("read")
-        if output not in self._world.schedule:
-            hint = did_you_mean(output, self._world.schedule)
-            raise ModelError(f"no output '{output}' has a sensor{hint}")
-        self._world.require_bound()
-        return self._unread.pop(output, None)
+        if self._run is not None:
+            self._refuse_while_running("read")
+        packet = self._unread.pop(output, None)
+        if packet is None:
+            if output not in self._world.schedule:
+                hint = did_you_mean(output, self._world.schedule)
+                raise ModelError(f"no output '{output}' has a sensor{hint}")
+            self._world.require_bound()
+        return packet
 
     # ---- it steps itself --------------------------------------------------------------------
 
@@ -261,10 +268,10 @@ class MuJoCo:
 
     def command(self, input_name: str, packet: Packet) -> None:
         """Drive the actuators that the node file declares for an input, from the next step on."""
-        command = self._world.commands.get(input_name)
+        command = self._world.bound.commands.get(input_name)
         if command is None:
             self._world.require_bound()
-            hint = did_you_mean(input_name, self._world.commands)
+            hint = did_you_mean(input_name, self._world.bound.commands)
             raise ModelError(f"no input '{input_name}' has an actuator{hint}")
         self._set(command, packet)
 
@@ -319,11 +326,11 @@ class MuJoCo:
     # ---- inside -----------------------------------------------------------------------------
 
     def _set(self, command: Command, packet: Packet) -> None:
-        if self.is_running:
+        if self._run is None:  # where the plugin steps, no other thread uses the data
+            self._put(command(packet))
+        else:
             with self.paused():
                 self._put(command(packet))
-        else:  # where the plugin steps, no other thread uses the data
-            self._put(command(packet))
 
     def _put(self, controls: Controls) -> None:
         ctrl = self._world.data.ctrl

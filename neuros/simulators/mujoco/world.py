@@ -84,7 +84,7 @@ class Declared:
             except ValueError as error:
                 problems.add(f"{sensor.pointer}/rate", str(error))
         self.schedule = FiringSchedule(periods)
-        self._bound = self._bind(self.model, problems)
+        self.bound = self._bind(self.model, problems)
         problems.raise_any()
 
     def _bind(self, model: Any, problems: Problems, *, may_wait: bool = True) -> _Bound:
@@ -119,6 +119,10 @@ class World(Declared):
 
     A declaration that names an element ``name/...`` waits until :meth:`spawn` adds that element;
     :meth:`require_bound` ends the waiting.
+
+    Attributes:
+        steps: timesteps since the start, or since the last reset.
+        time_s: the same in simulated seconds.
     """
 
     def __init__(self, node: NodeContext, model: Any, *, fine: bool) -> None:
@@ -130,26 +134,16 @@ class World(Declared):
         self._no_warnings = bytes(self._warnings.nbytes)
         if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
             import_opengl()  # raises now, not at the first image
-        self.steps = 0
+        self.steps, self.time_s = 0, 0.0
         self._seen_warnings: set[int] = set()
         self._fields = ModelFields(self.where)
         self._fields.apply(self.model)
         mujoco.mj_resetData(self.model, self.data)
         forward(self.model, self.data)
 
-    @property
-    def time_s(self) -> float:
-        """Simulated seconds since the start, or since the last reset."""
-        return self.time.seconds(self.steps)
-
-    @property
-    def commands(self) -> Mapping[str, Command]:
-        """From packets to controls, by input."""
-        return self._bound.commands
-
     def require_bound(self) -> None:
         """Raise ``ModelError`` if a declaration names an element that has never been spawned."""
-        if not self._bound.is_complete:
+        if not self.bound.is_complete:
             problems = Problems(
                 self._node.description.file,
                 "; an entity that has it must be spawned before the first step",
@@ -161,20 +155,21 @@ class World(Declared):
         """Advance the physics; raises ``ModelError`` if it has become unstable."""
         mujoco.mj_step(self.model, self.data, nstep=count)
         self.steps += count
+        self.time_s = self.time.seconds(self.steps)
         if self._warnings.tobytes() != self._no_warnings:  # any() takes ten times as long
             self._report_warnings(count)
 
     def sense(self, outputs: Sequence[str]) -> dict[str, Packet]:
         """The packets of these sensors for the present state."""
-        sensors = self._bound.sensors
+        sensors = self.bound.sensors
         for output in outputs:
             if sensors[output].needs_forward:
                 forward(self.model, self.data)
                 break
-        time_ns = self.time.nanoseconds(self.steps)
+        time_ns, make_packet = self.time.nanoseconds(self.steps), self._node.make_packet
         packets = {}
         for output in outputs:
-            sensor, packet = sensors[output], self._node.make_packet(output)
+            sensor, packet = sensors[output], make_packet(output)
             packets[output] = packet
             if sensor.is_array:
                 sensor.fill_array(packet, self.data)
@@ -187,7 +182,7 @@ class World(Declared):
         self._fields.apply(self.model)
         mujoco.mj_resetData(self.model, self.data)
         forward(self.model, self.data)
-        self.steps = 0
+        self.steps, self.time_s = 0, 0.0
 
     def check_fields(self, variables: Mapping[str, str]) -> None:
         """Check the fields of the model that a fork will change. Raises ``ModelError``."""
@@ -253,7 +248,7 @@ class World(Declared):
         self._fields = ModelFields(self.where)
         self._warnings = self.data.warning.number
         self.cameras.use(self.model)
-        self._bound = self._bind(self.model, Problems(self._node.description.file))
+        self.bound = self._bind(self.model, Problems(self._node.description.file))
         mujoco.mj_forward(self.model, self.data)
         dofs = np.flatnonzero(np.isin(old.dof_bodyid, bodies))
         mocaps = old.body_mocapid[bodies]
