@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from neuros.control import Report
+from neuros.control import NodeProbe, Report
 from neuros.control.link import read_as
 from neuros.errors import ControlError
 from neuros.project.model import Connection, NodeFile
@@ -187,13 +187,27 @@ class Peers:
         """The run here drains."""
         self._publish(phase=DRAINING, drain_s=drain_s, **self._because(reason, 0))
 
-    def agree_on_end(self, probes: Mapping[str, Report]) -> bool:
+    def agree_on_end(self, probes: Mapping[str, NodeProbe]) -> bool:
         """The run here is drained by itself; returns whether peers agree, and nothing is under way.
 
         Others count it as drained only while the counters of both ends are equal. A packet under
         way shows in them (Mattern's counters, see :mod:`neuros.launcher.quiescence`).
         """
-        counters = counters_of(probes, self._crossing)
+        crossing = {str(connection) for connection in self._crossing}
+        counters: Counters = {
+            name: {
+                side: {
+                    key: {counted: total, "acknowledged": acknowledged}
+                    for key, (total, acknowledged) in ends.items()
+                    if key in crossing
+                }
+                for side, counted, ends in (
+                    ("outgoing", "sent", probe.sent),
+                    ("incoming", "received", probe.received),
+                )
+            }
+            for name, probe in probes.items()
+        }
         if (self._own.phase, self._own.counters) != (DRAINED, counters):
             self._publish(phase=DRAINED, counters=counters)
         return all(self._agrees(each) for each in self._others.values() if each.has_just_begun)

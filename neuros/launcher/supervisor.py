@@ -23,7 +23,7 @@ import neuros.control as control
 from neuros.control import Message, Report
 from neuros.control.link import ControlLink
 from neuros.errors import ControlError
-from neuros.launcher.channels import Channels, Observers, PauseState, RestDetector
+from neuros.launcher.channels import Channels, Observers, PauseState
 from neuros.launcher.finalising import LEAVE_S, FinaliseTimes
 from neuros.launcher.outcome import (
     EXIT_CODES,
@@ -143,11 +143,17 @@ class Supervisor:
         self._processes = Processes(self._detector, self.outcome)
         self._backlog = Backlog(connections, self._detector.is_held_up)
         peers_to_ask = self._peers if self._peers.exist else None
-        self._probing = Probing(self._names, connections, self._channels.send, peers_to_ask)
+        self._probing = Probing(
+            self._names,
+            connections,
+            self._channels.send,
+            peers_to_ask,
+            lambda: self._channels.greeted >= self._names,
+        )
+        self._session: ControlLink | None = None  # it waits for the end of a step
         self._declarations = Declarations(files)
         limits_s = {file.node.name: finalise_s or file.node.finalise_s for file in files}
         self._finalising = FinaliseTimes(limits_s, run_folder)
-        self._rest_detector = RestDetector(self._names, self._channels)
         self.pause = PauseState(self._channels.send, time.monotonic)
         if is_held:
             self.pause.begin()
@@ -191,12 +197,11 @@ class Supervisor:
             has_shown = True
             self._last_tick_s = time.monotonic()
             while self._processes and not self._is_hopeless:
-                self._channels.wait(min(self._pause_s(has_shown), self._rest_detector.wait_s))
+                self._channels.wait(self._pause_s(has_shown))
                 self._handle_requests()
                 self._receive()
                 self._check_processes()
                 self._tick()
-                self._rest_detector.check()
                 self._channels.flush()
                 has_shown = bool(self._output.poll())
         finally:
@@ -271,8 +276,13 @@ class Supervisor:
                 self.outcome.add(message, now_s)
                 self._detector.report(message, now_s)
                 self._backlog.report(message, now_s)
-                if isinstance(message, control.Probed):
-                    self._probing.add(message)
+            case control.Probed():
+                self._probing.add(message, now_s)
+                if self._session is not None and self._probing.verdict is Verdict.AT_REST:
+                    # A pause takes back what hooks could not use of a step.
+                    self._channels.send(control.Pause())
+                    self._channels.send_to(self._session, self._probing.end_rest())
+                    self._session = None
             case control.Hello(nodes, plugins):
                 self._detector.greet(nodes, plugins, now_s)
                 if self._peers.exist:
@@ -306,12 +316,13 @@ class Supervisor:
                 self._peers.receive(node, text, now_s)
             case control.Advance():
                 self.pause.step(message.rounds, is_driven=self._detector.is_driven)
-                self._rest_detector.ask(link, message)
-            case control.AtRest():
                 if self.phase in _BEFORE_END:  # else the session hears of the end
-                    self._rest_detector.add(message)
+                    self._session = link
+                    self._probing.await_rest(message, now_s)
             case control.Resume():
-                self._rest_detector.give_up(link)
+                if link is self._session:
+                    self._session = None
+                    self._probing.end_rest()
                 self.observers.receive(link, message)
             case control.Interrupt():
                 self._signals.append(signal.SIGINT)
@@ -380,9 +391,12 @@ class Supervisor:
 
     def _pause_s(self, has_shown: bool) -> float:
         """Seconds until the next tick; ``has_shown``: nodes are logging now."""
-        if has_shown or self.phase not in _BEFORE_END:
-            return _TICK_S
-        return min(_QUIET_TICK_S, max(0.0, self._end_s - time.monotonic()))
+        is_busy = has_shown or self.phase not in _BEFORE_END
+        longest_s = _TICK_S if is_busy else _QUIET_TICK_S
+        if self.phase not in _BEFORE_STOP:
+            return longest_s
+        due_s = min(self._probing.due_s, math.inf if is_busy else self._end_s)
+        return min(longest_s, max(0.0, due_s - time.monotonic()))
 
     @property
     def _end_s(self) -> float:
@@ -451,6 +465,8 @@ class Supervisor:
     def _tick_running(self, now_s: float) -> None:
         if self.phase not in _BEFORE_END:
             return
+        if self._session is not None:
+            self._probing.check(now_s, 0.0)
         if self.pause.is_on:
             self._detector.begin_anew(now_s)
             self._backlog.begin_anew()

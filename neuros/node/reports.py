@@ -7,8 +7,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from neuros.control import HookDeclaration, Hooks, LiveCounters, Metrics, NodeStatus, Probed, Report
+from neuros.control import (
+    HookDeclaration,
+    Hooks,
+    LiveCounters,
+    Metrics,
+    NodeProbe,
+    NodeStatus,
+    Report,
+)
 from neuros.engine.engine import Engine
+from neuros.engine.metrics import State
 from neuros.engine.snapshot import explain, snapshot, steadily
 from neuros.hooks import HookKind, HookSpec
 from neuros.node.instruments import NodeRecorder
@@ -139,21 +148,31 @@ class NodeReports:
             self._keeps(),
         )
 
-    def probe(self, number: int, *, is_idle: bool, has_free_threads: bool) -> Probed:
-        """A report between two events, with what can be known only then. Loop thread only.
+    def probe(self, *, is_idle: bool, has_free_threads: bool) -> NodeProbe:
+        """Where the node stands between two events. Loop thread only.
 
         A thread of a plugin may submit packets, or end the project, at any time.
         """
         engine = self._engine
         assert engine is not None
-        return Probed(
-            **self._state(),
-            number=number,
+        rest = engine.rest()
+        incoming = [s for s in engine.subscriptions.values() if isinstance(s.key, Connection)]
+        return NodeProbe(
+            sent={
+                str(w.connection): (w.sent, w.acknowledged) for w in engine.send_windows.values()
+            },
+            received={s.name: (s.received, s.acknowledged) for s in incoming},
+            unread=frozenset(s.name for s in incoming if s.unread),
+            executions=sum(hook.executions for hook in engine.all_hooks),
+            lacks=rest.cause if rest.state is State.WAITING else "",
+            sim_time=self._time.now_s,
+            is_active=engine.is_active,
             is_startable=engine.has_startable_packet,
             is_wakeable=has_free_threads
             or engine.is_wakeable
             or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file)),
             is_idle=is_idle,
+            is_virtual=self._file.time == VIRTUAL,
         )
 
 
