@@ -11,6 +11,7 @@ from itertools import pairwise
 from typing import Any, Protocol
 
 from neuros.control import Report
+from neuros.launcher.nodes import NodeView
 from neuros.launcher.stall_detector import StallDetector
 from neuros.ports import RunningNode
 
@@ -151,10 +152,6 @@ class Outcome:
             self.timelines.setdefault(name, []).extend(report.timeline)
             self.report_times_s[name] = now_s
 
-    def shift(self, still_s: float) -> None:
-        """The launcher stood still for so long, and perhaps the nodes: their reports are as new."""
-        self.report_times_s = {n: at_s + still_s for n, at_s in self.report_times_s.items()}
-
     def begin_to_end(self, now_s: float) -> None:
         """The end has been asked for; the first time counts."""
         if self.ending_s is None:
@@ -163,10 +160,6 @@ class Outcome:
     def has_final_report(self, name: str) -> bool:
         """Whether a node has come to its end."""
         return name in self.reports and self.reports[name].is_final
-
-    def final_report_s(self, name: str) -> float:
-        """When a node came to its end, on the monotonic clock; 0 if it has not."""
-        return self.report_times_s[name] if self.has_final_report(name) else 0.0
 
     def end_by_force(self, exit_code: int, name: str) -> None:
         """The user has had killed what was left of a run, by a signal of this name."""
@@ -211,6 +204,7 @@ class Processes:
         killed: the nodes whose processes were killed, or are to be.
     """
 
+    _nodes: Mapping[str, NodeView]
     _detector: StallDetector
     _outcome: Outcome
     _running: list[RunningNode] = field(default_factory=list)
@@ -253,7 +247,7 @@ class Processes:
         """One sentence about a process that should not have ended."""
         if is_stopping:
             when = "while finalising"
-        elif not any(map(self._detector.is_greeted, process.names)):
+        elif not any(self._nodes[name].is_there for name in process.names):
             were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
             when = f"before {were} wrote is above)"
         else:

@@ -24,7 +24,7 @@ from neuros.control import Message, Report
 from neuros.control.link import ControlLink
 from neuros.errors import ControlError
 from neuros.launcher.channels import Channels, Observers, PauseState
-from neuros.launcher.finalising import LEAVE_S, FinaliseTimes
+from neuros.launcher.nodes import LEAVE_S, NodeView, finalising, left_s
 from neuros.launcher.outcome import (
     EXIT_CODES,
     SIGNAL_NAMES,
@@ -129,7 +129,10 @@ class Supervisor:
         self._duration_s = duration_s
         self._peers = peers or Peers("", (), files)
         self._on_stop = on_stop
-        self._names = frozenset(file.node.name for file in files)
+        self._nodes: dict[str, NodeView] = {}
+        for file in files:
+            name, limit_s = file.node.name, finalise_s or file.node.finalise_s
+            self._nodes[name] = NodeView(name, limit_s, run_folder / name)
         connections = connections_among(files)
 
         self.phase = Phase.STARTING
@@ -139,21 +142,19 @@ class Supervisor:
             self._channels.wake_on(waker)
         self._peers.publish_through(lambda text: self._channels.send(control.PublishState(text)))
         self._reader = ThreadReader(lambda name: self._processes.with_node(name))
-        self._detector = StallDetector(sorted(self._names), time.monotonic(), self._reader)
-        self._processes = Processes(self._detector, self.outcome)
+        self._detector = StallDetector(self._nodes, time.monotonic(), self._reader)
+        self._processes = Processes(self._nodes, self._detector, self.outcome)
         self._backlog = Backlog(connections, self._detector.is_held_up)
         peers_to_ask = self._peers if self._peers.exist else None
         self._probing = Probing(
-            self._names,
+            self._nodes,
             connections,
             self._channels.send,
             peers_to_ask,
-            lambda: self._channels.greeted >= self._names,
+            lambda: all(node.is_there for node in self._nodes.values()),
         )
         self._session: ControlLink | None = None  # it waits for the end of a step
         self._declarations = Declarations(files)
-        limits_s = {file.node.name: finalise_s or file.node.finalise_s for file in files}
-        self._finalising = FinaliseTimes(limits_s, run_folder)
         self.pause = PauseState(self._channels.send, time.monotonic)
         if is_held:
             self.pause.begin()
@@ -270,6 +271,12 @@ class Supervisor:
 
     def _on_message(self, link: ControlLink, message: Message) -> None:
         now_s = time.monotonic()
+        if (senders := self._channels.nodes_of(link)) and not isinstance(
+            message, control.StateOfPeer
+        ):
+            for name in (*senders, getattr(message, "node", "")):
+                if name and name not in self._nodes:
+                    raise ControlError(f"this run has no node '{name}'")
         match message:
             case Report():
                 self._extend_drain(message, now_s)
@@ -284,21 +291,22 @@ class Supervisor:
                     self._channels.send_to(self._session, self._probing.end_rest())
                     self._session = None
             case control.Hello(nodes, plugins):
-                self._detector.greet(nodes, plugins, now_s)
+                for name in nodes:
+                    self._nodes[name].connect(nodes, plugins, now_s)
                 if self._peers.exist:
                     self._channels.send_to(link, control.PublishState(self._peers.own_state))
                 if self.pause.is_on:
                     self._channels.send_to(link, control.Pause())
             case control.Ready(node):
-                self._detector.ready.add(node)
+                self._nodes[node].is_ready = True
             case control.Hooks(node):
                 self._declarations.add(message)
-                self._finalising.declare(node, message.finalise)
-                self._detector.loaded.add(node)
+                self._nodes[node].hooks_left = list(message.finalise)
+                self._nodes[node].is_loaded = True
             case control.Finalising(node, hook):
-                self._finalising.enter(node, hook, now_s)
+                self._nodes[node].enter(hook, now_s)
             case control.Progress(node, text):
-                self._finalising.advance(node, now_s)
+                self._nodes[node].advance(now_s)
                 if text and now_s - self._told_s.get(node, 0.0) >= _TELL_S:
                     self._told_s[node] = now_s
                     self._log("INFO", f"{node}: {text}")
@@ -413,8 +421,8 @@ class Supervisor:
             self._detector.shift(still_s)
             self._backlog.begin_anew()
             self._deadline_s += still_s
-            self._finalising.shift(still_s)
-            self.outcome.shift(still_s)
+            for node in self._nodes.values():
+                node.shift(still_s)
         if end := self._peers.end(now_s):
             self._handle(RunEvent.ENDED_ELSEWHERE, end)
         self._handle(RunEvent.TICK, now_s)
@@ -440,12 +448,12 @@ class Supervisor:
 
     def _tick_starting(self, now_s: float) -> None:
         """Every plugin loads, here and at peers; then nodes initialise; then the run begins."""
-        if self._detector.loaded >= self._names:
+        if all(node.is_loaded for node in self._nodes.values()):
             self._peers.reach(Stage.LOADED)
             if not self._has_begun and self._peers.have_reached(Stage.LOADED):
                 self._has_begun = True
                 self._channels.send(control.Begin())
-        if self._detector.ready >= self._names:
+        if all(node.is_ready for node in self._nodes.values()):
             self._peers.reach(Stage.READY)
             if self._peers.have_reached(Stage.READY):
                 self._begin_to_run(now_s)
@@ -572,7 +580,8 @@ class Supervisor:
         self.phase = Phase.STOPPING
         now_s = time.monotonic()
         self.outcome.begin_to_end(now_s)
-        self._finalising.begin(now_s)
+        for node in self._nodes.values():
+            node.begin_to_end(now_s)
         self._peers.stop(self.outcome.exit_code, self.outcome.reason)
         self._channels.send(control.Stop())
         if not self._has_begun:  # no hook has run, so there is nothing to save
@@ -587,8 +596,9 @@ class Supervisor:
         self._on_stop()
 
     def _tick_stopping(self, now_s: float) -> None:
-        for text in self._finalising.remarks(now_s):
-            self._log("INFO", text)
+        for node in self._nodes.values():
+            if text := node.saving(now_s):
+                self._log("INFO", text)
         running = [p for p in self._processes if not self._processes.killed.issuperset(p.names)]
         left = [(process, self._left_s(process, now_s)) for process in running]
         self._begin_to_read([process for process, left_s in left if left_s < _READ_EARLY_S])
@@ -599,16 +609,16 @@ class Supervisor:
         if len(overdue) == len(running):
             self._wait_for_killed()
             return
-        have_stopped = all(self._finalising.has_begun(process.names) for process in running)
+        have_stopped = all(any(n.has_stopped for n in self._nodes_of(p)) for p in running)
         if have_stopped and self._peers.exist and self._peers.finish(self.outcome.reports, now_s):
             self._channels.send(control.Leave())
 
     def _left_s(self, process: RunningNode, now_s: float) -> float:
         """How long a process may go on without a sign of progress."""
-        reported_s = [self.outcome.final_report_s(name) for name in process.names]
-        if all(reported_s):
-            return max(reported_s) + LEAVE_S - now_s
-        return self._finalising.left_s(process.names, now_s)
+        nodes = self._nodes_of(process)
+        if all(map(self.outcome.has_final_report, process.names)):
+            return LEAVE_S - min(node.silent_s(now_s) for node in nodes)
+        return left_s(nodes, now_s)
 
     def _why_killed(self, process: RunningNode, now_s: float) -> str:
         """A sentence about a process whose nodes have had their time."""
@@ -618,26 +628,30 @@ class Supervisor:
         if not late:
             after, why = f"{LEAVE_S:g} s after its final report", "its process did not end"
         else:
-            limit_s = self._finalising.limits_s[at_it or late[0]]
+            limit_s = self._nodes[at_it or late[0]].finalise_s
             clauses = [clause for name in late for clause in self._unfinished(name, now_s)]
             after, why = f"after {limit_s:g} s without progress", "; ".join(clauses)
         return f"{who} had to be killed {after}: {why}"
 
     def _finalising_in(self, process: RunningNode) -> str:
         """The node that keeps the others of its process waiting while it finalises; else empty."""
-        return self._finalising.current(process.names) if len(process.names) > 1 else ""
+        node = finalising(self._nodes_of(process)) if len(process.names) > 1 else None
+        return node.name if node else ""
+
+    def _nodes_of(self, process: RunningNode) -> list[NodeView]:
+        return [self._nodes[name] for name in process.names]
 
     def _unfinished(self, name: str, now_s: float) -> list[str]:
         """Clauses about a node that has not made its final report."""
-        hook, is_finalising = self._detector.executing(name), self._finalising.has_begun([name])
-        clauses = self._finalising.unfinished(name)
-        if hook and not is_finalising:
+        node, hook = self._nodes[name], self._detector.executing(name)
+        clauses = node.unfinished()
+        if hook and not node.has_stopped:
             clauses.insert(0, f"'{name}' was still executing '{hook}'")
         if clauses:
             return clauses
-        if is_finalising:
+        if node.has_stopped:
             return [f"'{name}' had finalised, but did not make its final report"]
-        silent_s = self._detector.silent_s(name, now_s)
+        silent_s = node.silent_s(now_s)
         silence = f" and had not reported for {silent_s:.0f} s" if silent_s >= SILENT_S else ""
         return [f"'{name}' did not begin to finalise{silence}"]
 
