@@ -220,9 +220,9 @@ def test_it_is_drained_when_both_launchers_are_and_nothing_is_between(launcher: 
     assert not launcher.peers.agree_on_end(sent(3)), "the peer has not heard of it yet"
     assert said_last(launcher).phase == DRAINED
     drained = replace(ELSEWHERE, phase=DRAINED)
-    launcher.hears("b", replace(drained, number=2, counters=received(2)))
+    launcher.hears("b", replace(drained, number=2, received={str(HERE_TO_THERE): (2, 2)}))
     assert not launcher.peers.agree_on_end(sent(3)), "a packet is under way"
-    launcher.hears("b", replace(drained, number=3, counters=received(3)))
+    launcher.hears("b", replace(drained, number=3, received={str(HERE_TO_THERE): (3, 3)}))
     assert not launcher.peers.agree_on_end(sent(3, acknowledged=2)), "an acknowledgement is"
     assert launcher.peers.agree_on_end(sent(3))
 
@@ -267,7 +267,8 @@ def test_but_not_for_long_and_not_for_one_that_is_gone(launcher: Launcher) -> No
 
 
 def test_a_state_comes_through_as_it_was() -> None:
-    state = PeerState("r", "h", 4, Stage.LOADED, RUNNING, 0, "é", "o", 1.5, received(3))
+    ends = {"a.o -> b.x": (3, 2)}
+    state = PeerState("r", "h", 4, Stage.LOADED, RUNNING, 0, "é", "o", 1.5, received(3), ends, ends)
     assert state_from(state.to_text()) == state
 
 
