@@ -164,8 +164,13 @@ class Report(Message, kw_only=True):
     virtual_s: float | None = None
 
 
-class NodeProbe(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class NodeProbe(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
+):
     """Where a node stands between two events.
+
+    At the end of a step it tells no more than counters of connections to other processes, its
+    simulated time and whether it is active.
 
     Attributes:
         sent: by connection, packets sent and acknowledged.

@@ -293,11 +293,14 @@ def is_at_rest(probes: Probes, connections: Sequence[Connection], same_s: float)
 
     ``same_s``: for how long the counters have been the same, in seconds.
     """
-    has_lost = any(sent[0] != received[0] for _, sent, received in _ends(probes, connections))
-    return (
-        all(probe.is_active for probe in probes.values())
-        and not under_way(probes, connections)
-        and (not has_lost or same_s >= _LOST_AFTER_S)
+    under_way = [
+        connection.is_reliable
+        for connection, sent, received in _ends(probes, connections)
+        if (sent != received if connection.is_reliable else sent[0] != received[0])
+    ]
+    has_lost = bool(under_way) and not any(under_way)
+    return all(probe.is_active for probe in probes.values()) and (
+        not under_way or (has_lost and same_s >= _LOST_AFTER_S)
     )
 
 
@@ -360,13 +363,14 @@ def _ring_through(start: _T, following: Callable[[_T], Iterable[_T]]) -> list[_T
 def _ends(
     probes: Probes, connections: Sequence[Connection]
 ) -> Iterator[tuple[Connection, tuple[int, int], tuple[int, int]]]:
-    """The counters at both ends of every connection between nodes that were probed."""
+    """The counters at both ends of every connection between nodes that tell them."""
     for connection in connections:
         sender = probes.get(connection.source_node)
         receiver = probes.get(connection.destination_node)
-        if sender and receiver:
+        if sender and receiver and sender.sent:
             key = str(connection)
-            yield connection, sender.sent[key], receiver.received[key]
+            if key in sender.sent:
+                yield connection, sender.sent[key], receiver.received[key]
 
 
 class DeclaredHook(HookDeclaration, frozen=True):

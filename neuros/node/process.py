@@ -241,7 +241,7 @@ class NodeProcess:
         self._tell(node.reports.report(is_final=True))
 
     def _answer(self, asked: control.Probe) -> None:
-        """Tell where all nodes stand at one moment, with the new packets that are asked for."""
+        """Tell where all nodes stand at one moment."""
         assert self._middleware is not None
         is_idle = not self._middleware.loop.has_waiting_events
         # A thread besides those of NeuROS that does not wait for a connection may wake a node.
@@ -251,18 +251,11 @@ class NodeProcess:
             thread not in bound and not isinstance(thread, ControlThread)
             for thread in threading.enumerate()
         )
-        packets = {
-            name: (history.count, history.since(asked.known[name]))
-            for node in self._nodes.values()
-            for output, history in node.histories.by_output.items()
-            if (name := f"{node.name}.{output}") in asked.known
-            and history.count > asked.known[name]
-        }
         probes = {
             name: node.reports.probe(is_idle=is_idle, has_free_threads=has_free_threads)
             for name, node in self._nodes.items()
         }
-        self._tell(control.Probed(asked.number, probes, packets))
+        self._tell(control.Probed(asked.number, probes))
 
     def _when_idle(self, action: Event) -> None:
         """Do something once no event waits: a hook that may start has a loop-back waiting."""
@@ -283,8 +276,17 @@ class NodeProcess:
     def _answer_asked(self) -> None:
         """Answer the last probe of a step, unless the run was resumed meanwhile."""
         asked, self._asked = self._asked, None
-        if asked is not None and not self.is_ending:
-            self._answer(asked)
+        if asked is None or self.is_ending:
+            return
+        packets = {
+            name: (history.count, history.since(asked.known[name]))
+            for node in self._nodes.values()
+            for output, history in node.histories.by_output.items()
+            if (name := f"{node.name}.{output}") in asked.known
+            and history.count > asked.known[name]
+        }
+        probes = {n: node.reports.probe_at_rest(self._nodes) for n, node in self._nodes.items()}
+        self._tell(control.Probed(asked.number, probes, packets))
 
     def _reset(self, asked: control.Reset) -> None:
         """Bring all nodes back to their start, if they can still be."""

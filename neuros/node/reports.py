@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
+
+from msgspec import structs
 
 from neuros.control import (
     HookDeclaration,
@@ -156,23 +158,42 @@ class NodeReports:
         engine = self._engine
         assert engine is not None
         rest = engine.rest()
-        incoming = [s for s in engine.subscriptions.values() if isinstance(s.key, Connection)]
-        return NodeProbe(
-            sent={
-                str(w.connection): (w.sent, w.acknowledged) for w in engine.send_windows.values()
-            },
-            received={s.name: (s.received, s.acknowledged) for s in incoming},
-            unread=frozenset(s.name for s in incoming if s.unread),
+        is_wakeable = (
+            has_free_threads
+            or engine.is_wakeable
+            or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file))
+        )
+        return structs.replace(
+            self.probe_at_rest(()),
+            unread=frozenset(s.name for s in engine.subscriptions.values() if s.unread),
             executions=sum(hook.executions for hook in engine.all_hooks),
             lacks=rest.cause if rest.state is State.WAITING else "",
-            sim_time=self._time.now_s,
-            is_active=engine.is_active,
             is_startable=engine.has_startable_packet,
-            is_wakeable=has_free_threads
-            or engine.is_wakeable
-            or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file)),
+            is_wakeable=is_wakeable,
             is_idle=is_idle,
             is_virtual=self._file.time == VIRTUAL,
+        )
+
+    def probe_at_rest(self, here: Container[str]) -> NodeProbe:
+        """Where the node stands at the end of a step, when no event waits. Loop thread only.
+
+        Connections with the nodes ``here`` are left out: nothing is under way on them then.
+        """
+        engine = self._engine
+        assert engine is not None
+        return NodeProbe(
+            sent={
+                str(window.connection): (window.sent, window.acknowledged)
+                for window in engine.send_windows.values()
+                if window.connection.destination_node not in here
+            },
+            received={
+                each.name: (each.received, each.acknowledged)
+                for each in engine.subscriptions.values()
+                if isinstance(each.key, Connection) and each.key.source_node not in here
+            },
+            sim_time=self._time.now_s,
+            is_active=engine.is_active,
         )
 
 
