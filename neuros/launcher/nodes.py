@@ -35,6 +35,8 @@ class NodeView:
         is_there: whether its process has connected.
         is_loaded: whether its plugin has been imported.
         is_ready: whether it has initialised as far as it can alone.
+        has_failed: whether it has reported that it failed, so that its process may end.
+        is_killed: whether its process was killed, or is to be.
         report: the newest.
         heard_s: when it reported last, or its process has connected.
         hooks_left: finalise hooks that have not started.
@@ -50,6 +52,8 @@ class NodeView:
     is_there: bool = False
     is_loaded: bool = False
     is_ready: bool = False
+    has_failed: bool = False
+    is_killed: bool = False
     report: Report | None = None
     heard_s: float | None = None
     hooks_left: list[str] = field(default_factory=list)

@@ -6,7 +6,7 @@ Reports come once per second, so what is said here is up to a second late.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from neuros.control import Report
@@ -157,9 +157,7 @@ class StallDetector:
                     text = f"{name} has been executing '{hook['name']}' for {LONG_S:g} s"
                     yield "WARN", with_stack(text, report.stack)
 
-    def remarks_on_silence(
-        self, now_s: float, without: Collection[str] = ()
-    ) -> Iterator[tuple[str, str]]:
+    def remarks_on_silence(self, now_s: float) -> Iterator[tuple[str, str]]:
         """Processes that do not report, each once, and where they stand; not if they were killed.
 
         One that still imports only informs, and its stack is for the log.
@@ -168,7 +166,7 @@ class StallDetector:
         """
         for name, node in self._nodes.items():
             silent_s = node.silent_s(now_s)
-            if silent_s < LONG_S or name in self._named_as_mute or name in without:
+            if silent_s < LONG_S or name in self._named_as_mute or node.is_killed:
                 continue
             names = node.together
             self._reader.begin(names[0])

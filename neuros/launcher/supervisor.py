@@ -30,7 +30,6 @@ from neuros.launcher.outcome import (
     SIGNAL_NAMES,
     Outcome,
     Phase,
-    Processes,
     SupervisorOutput,
     names_of,
     nodes_of,
@@ -141,9 +140,11 @@ class Supervisor:
         if waker is not None:
             self._channels.wake_on(waker)
         self._peers.publish_through(lambda text: self._channels.send(control.PublishState(text)))
-        self._reader = ThreadReader(lambda name: self._processes.with_node(name))
+        self._processes: list[RunningNode] = []  # that run
+        self._reader = ThreadReader(
+            lambda name: next((each for each in self._processes if name in each.names), None)
+        )
         self._detector = StallDetector(self._nodes, time.monotonic(), self._reader)
-        self._processes = Processes(self._nodes, self._detector, self.outcome)
         self._backlog = Backlog(connections, self._detector.is_held_up)
         peers_to_ask = self._peers if self._peers.exist else None
         self._probing = Probing(
@@ -194,7 +195,7 @@ class Supervisor:
         try:
             self._handle_requests()  # one may have come before anything was started
             if self.phase is Phase.STARTING:
-                self._processes.add(self._launcher.start(self._files, self._environment))
+                self._processes = [*self._launcher.start(self._files, self._environment)]
             has_shown = True
             self._last_tick_s = time.monotonic()
             while self._processes and not self._is_hopeless:
@@ -316,8 +317,8 @@ class Supervisor:
                 self._handle(RunEvent.END, why, drain_s, node, True)
             case control.Failed(node, text):
                 # Of a run that ends well, the failure of a node that was killed does not matter.
-                if self.outcome.failures or node not in self._processes.killed:
-                    self._processes.failed.add(node)
+                if self.outcome.failures or not self._nodes[node].is_killed:
+                    self._nodes[node].has_failed = True
                     first_line = (text.strip() or "no reason was given").splitlines()[0]
                     self._fail(f"node '{node}' failed: {first_line}")
             case control.StateOfPeer(node, text):
@@ -340,18 +341,20 @@ class Supervisor:
     # ------------------------------------------------------------------ processes
 
     def _check_processes(self) -> None:
-        ended = self._processes.ended()
+        ended = [(process, how) for process in self._processes if (how := process.poll())]
         if ended:
+            gone = [process for process, _ in ended]
+            self._processes = [each for each in self._processes if each not in gone]
             self._receive()  # what they said last has arrived by now
         for process, how in ended:
-            is_stopping = self.phase is Phase.STOPPING
-            if not self._processes.may_end(process, is_stopping=is_stopping):
-                self._fail(
-                    self._processes.how_it_failed(process, how, is_stopping=is_stopping),
-                    exit_code=4 if process.is_abandoned else 1,
-                )
-            elif text := self._processes.how_it_left(process, how):
-                self._log("WARN", text)
+            if not self._may_end(process, is_stopping=self.phase is Phase.STOPPING):
+                text = f"{nodes_of(process)} ended {self._when_it_ended(process)}: {how}"
+                self._fail(text, exit_code=4 if process.is_abandoned else 1)
+            elif how != "exit code 0" and not any(
+                node.is_killed or node.has_failed for node in self._nodes_of(process)
+            ):
+                text = f"the process of {nodes_of(process)} ended badly after its final report"
+                self._log("WARN", f"{text}: {how}")
 
         for process in self._processes:
             if self._is_cut_off(process):
@@ -362,11 +365,26 @@ class Supervisor:
                     " opened?"
                 )
 
+    def _may_end(self, process: RunningNode, *, is_stopping: bool) -> bool:
+        """Whether its nodes have made their final reports, or have reported a failure."""
+        if self._is_killed(process) or any(node.has_failed for node in self._nodes_of(process)):
+            return True
+        return is_stopping and all(map(self.outcome.has_final_report, process.names))
+
+    def _when_it_ended(self, process: RunningNode) -> str:
+        """When a process has ended that should not have."""
+        if self.phase is Phase.STOPPING:
+            return "while finalising"
+        if any(node.is_there for node in self._nodes_of(process)):
+            return f"unexpectedly{''.join(map(self._detector.last_seen, process.names))}"
+        were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
+        return f"before {were} wrote is above)"
+
     def _is_cut_off(self, process: RunningNode) -> bool:
         """Whether a process runs on without its control connection, before its final reports."""
         for names, since_s in self._channels.parted.items():
             if {*names} & {*process.names} and time.monotonic() - since_s > _PARTED_S:
-                return not self._processes.may_end(process, is_stopping=True)
+                return not self._may_end(process, is_stopping=True)
         return False
 
     def _kill(self, processes: Sequence[RunningNode]) -> None:
@@ -376,7 +394,8 @@ class Supervisor:
         now_s = time.monotonic()
         stood = [(process, *self._detector.where(process.names, now_s)) for process in processes]
         for process in processes:
-            self._processes.kill(process)
+            self._mark_as_killed(process)
+            process.kill()
         for process, texts, read in stood:
             if at_it := self._finalising_in(process):  # others may be of the same plugin
                 texts = {name: text for name, text in texts.items() if name == at_it}
@@ -390,6 +409,17 @@ class Supervisor:
                 text = f"where {names_of(process)} stood when killed is not known: {read.problem}"
                 self._log("WARN", text)
             self.outcome.stacks.update(texts)
+
+    def _mark_as_killed(self, process: RunningNode) -> None:
+        for node in self._nodes_of(process):
+            node.is_killed = True
+
+    def _is_killed(self, process: RunningNode) -> bool:
+        return all(node.is_killed for node in self._nodes_of(process))
+
+    @property
+    def _killed(self) -> list[str]:
+        return [node.name for node in self._nodes.values() if node.is_killed]
 
     def _begin_to_read(self, processes: Sequence[RunningNode]) -> None:
         for process in processes:
@@ -433,7 +463,7 @@ class Supervisor:
             self.outcome.ending_s = self.pause.since_s
         self._show(self._detector.remarks_on_hooks())
         if self.phase in _BEFORE_STOP:
-            self._show(self._detector.remarks_on_silence(now_s, self._processes.killed))
+            self._show(self._detector.remarks_on_silence(now_s))
         # To observers, a run that starts is running.
         self.observers.update(Phase.RUNNING if self.phase is Phase.STARTING else self.phase)
 
@@ -517,7 +547,7 @@ class Supervisor:
         self._log("INFO", f"{reason}; letting packets under way arrive")
         self._peers.drain(reason, drain_s)
         self._channels.send(control.Drain(self._declarations.last_round(stopped), is_asked))
-        self._probing.drain(self._processes.killed, now_s)
+        self._probing.drain(self._killed, now_s)
 
     def _extend_drain(self, report: Report, now_s: float) -> None:
         """In virtual time, nodes know how long they may drain; here, whether they get on."""
@@ -531,7 +561,7 @@ class Supervisor:
             if self._stops_hooks_first:
                 self._stops_hooks_first = False
                 self._channels.send(control.StopHooks())
-                self._probing.drain(self._processes.killed, now_s)
+                self._probing.drain(self._killed, now_s)
                 return
         elif now_s >= self._deadline_s:
             why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
@@ -568,7 +598,7 @@ class Supervisor:
             return
         self._log("WARN", f"{name} again: killing what is left")
         self.outcome.end_by_force(EXIT_CODES[number], name)
-        self._kill([*self._processes])
+        self._kill(self._processes)
         self._wait_for_killed()
 
     def _stop_with(self, exit_code: int, reason: str) -> None:
@@ -586,20 +616,20 @@ class Supervisor:
         self._channels.send(control.Stop())
         if not self._has_begun:  # no hook has run, so there is nothing to save
             for process in self._processes:
-                if self._processes.killed.issuperset(process.names):
+                if self._is_killed(process):
                     continue
+                self._mark_as_killed(process)
                 if self._peers.exist:  # nodes alone can tell peers of the end
-                    self._processes.killed.update(process.names)
                     self._kill_early_s = now_s + _CLOSING_S
                 else:
-                    self._processes.kill(process)
+                    process.kill()
         self._on_stop()
 
     def _tick_stopping(self, now_s: float) -> None:
         for node in self._nodes.values():
             if text := node.saving(now_s):
                 self._log("INFO", text)
-        running = [p for p in self._processes if not self._processes.killed.issuperset(p.names)]
+        running = [process for process in self._processes if not self._is_killed(process)]
         left = [(process, self._left_s(process, now_s)) for process in running]
         self._begin_to_read([process for process, left_s in left if left_s < _READ_EARLY_S])
         overdue = [process for process, left_s in left if left_s <= 0.0]
