@@ -7,8 +7,6 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from msgspec import structs
-
 from neuros.control import (
     HookDeclaration,
     Hooks,
@@ -163,8 +161,12 @@ class NodeReports:
             or engine.is_wakeable
             or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file))
         )
-        return structs.replace(
-            self.probe_at_rest(()),
+        at_rest = self.probe_at_rest(())
+        return NodeProbe(
+            sent=at_rest.sent,
+            received=at_rest.received,
+            sim_time=at_rest.sim_time,
+            is_active=at_rest.is_active,
             unread=frozenset(s.name for s in engine.subscriptions.values() if s.unread),
             executions=sum(hook.executions for hook in engine.all_hooks),
             lacks=rest.cause if rest.state is State.WAITING else "",

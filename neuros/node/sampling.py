@@ -7,7 +7,7 @@ fast it sends. What is copied while a packet passes is bounded; it is encoded by
 answers.
 
 Fields are named by their paths: ``pose.position.x``, ``ranges[3]``. Pictures of images are small:
-every k-th pixel of every k-th row.
+every k-th pixel of every k-th row, without any library.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import re
 import time
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol, TypeAlias
 
 from neuros.control import WORLD
@@ -86,12 +87,15 @@ class _Fields:
 
 
 class _One:
-    """One packet, of which ``read`` returns what there is to encode."""
+    """One packet: ``read`` copies what is needed of it, and ``encode`` makes it ready for JSON."""
 
-    def __init__(self, name: str, read: Callable[[Any], dict[str, Any]]) -> None:
+    def __init__(
+        self, name: str, read: Callable[[Any], Any], encode: Callable[[Any], dict[str, Any]] = dict
+    ) -> None:
         self._name = name
         self._read = read
-        self._found: dict[str, Any] | None = None
+        self._encode = encode
+        self._found: Any = None
         self.is_full = False
 
     def add(self, packet: Any) -> None:
@@ -99,10 +103,7 @@ class _One:
         self._found = self._read(packet)
 
     def answer(self) -> Mapping[str, Any]:
-        if self._found is None:
-            return {}
-        found = self._found.items()
-        return {self._name: {k: _base64(v) if isinstance(v, bytes) else v for k, v in found}}
+        return {} if self._found is None else {self._name: self._encode(self._found)}
 
 
 class _Spikes:
@@ -183,7 +184,7 @@ class _Request:
         if wanted.get("all"):
             self._parts.append(_One("all", lambda packet: all_fields(packet, most)))
         if wanted.get("image"):
-            self._parts.append(_One("image", preview))
+            self._parts.append(_One("image", preview, Preview.encode))
         self._fault: str | None = None
 
     @property
@@ -353,11 +354,50 @@ def _elements(values: Sequence[Any], path: str, most: int) -> Iterator[tuple[str
         yield from _walk(each, f"{path}[{place}]", most)
 
 
-def preview(packet: Any) -> dict[str, Any]:
-    """A small picture of a ``sensor_msgs`` Image or CompressedImage, as a copy.
+@dataclass(frozen=True)
+class Preview:
+    """A picture in the making: what was copied while the packet passed.
 
-    ``width``, ``height`` and ``encoding`` of ``data`` (bytes), and the size that it is ``of``; the
-    sizes of a compressed image are 0.
+    Attributes:
+        rows: of the pixels that are kept and those between them.
+        stride: every so many pixels one is kept.
+        pixel_bytes: 0 for what is compressed already, which is then the only row.
+    """
+
+    encoding: str
+    width: int
+    height: int
+    rows: tuple[bytes, ...]
+    stride: int
+    pixel_bytes: int
+
+    def encode(self) -> dict[str, Any]:
+        """The picture, ready for JSON: ``width``, ``height``, ``encoding``, ``data`` (base64)."""
+        size = self.pixel_bytes
+        if not size:
+            data = self.rows[0]
+            width, height = self.width, self.height
+        else:
+            width, height = -(-self.width // self.stride), len(self.rows)
+            picture = bytearray(width * height * size)
+            for y, row in enumerate(self.rows):
+                begin = y * width * size
+                for byte in range(size):
+                    picture[begin + byte : begin + width * size : size] = row[
+                        byte :: size * self.stride
+                    ]
+            data = bytes(picture)
+        return {
+            "width": width,
+            "height": height,
+            "of": [self.width, self.height],
+            "encoding": self.encoding,
+            "data": _base64(data),
+        }
+
+
+def preview(packet: Any) -> Preview:
+    """Copy what a picture needs from a ``sensor_msgs`` Image or CompressedImage.
 
     Raises:
         ValueError: if it is none that can be shown.
@@ -366,7 +406,7 @@ def preview(packet: Any) -> dict[str, Any]:
         data = bytes(packet.data)
         if len(data) > _MOST_COMPRESSED_BYTES:
             raise ValueError(f"a compressed image of {len(data)} bytes is too large to be shown")
-        return {"width": 0, "height": 0, "of": [0, 0], "encoding": packet.format, "data": data}
+        return Preview(packet.format, 0, 0, (data,), 1, 0)
     size = PIXEL_BYTES.get(packet.encoding)
     if size is None:
         raise ValueError(f"images with encoding '{packet.encoding}' are not shown")
@@ -376,18 +416,11 @@ def preview(packet: Any) -> dict[str, Any]:
         raise ValueError(
             f"{len(pixels)} bytes are not an image of {width} x {height}, {step} per row"
         )
-    import numpy as np  # messages bring it
-
     stride = max(1, -(-width // WIDTH), -(-height // HEIGHT))
-    rows = np.frombuffer(pixels, np.uint8)[: step * height].reshape(height, step)[::stride]
-    picture = rows[:, : width * size].reshape(len(rows), width, size)[:, ::stride]
-    return {
-        "width": picture.shape[1],
-        "height": picture.shape[0],
-        "of": [width, height],
-        "encoding": packet.encoding,
-        "data": picture.tobytes(),
-    }
+    rows = tuple(
+        bytes(pixels[y * step : y * step + width * size]) for y in range(0, height, stride)
+    )
+    return Preview(packet.encoding, width, height, rows, stride, size)
 
 
 def _base64(content: bytes | array[Any]) -> str:

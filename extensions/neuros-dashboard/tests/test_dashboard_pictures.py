@@ -25,8 +25,7 @@ def message(width: int, height: int, encoding: str, data: bytes, step: int = 0) 
 
 def shown(packet: Any) -> Decoder.Image:
     """What a decoder sees."""
-    picture = preview(packet)
-    url = data_url({**picture, "data": base64.b64encode(picture["data"]).decode()})
+    url = data_url(preview(packet).encode())
     assert url is not None
     kind, _, data = url.partition(";base64,")
     assert kind.startswith("data:image/")
