@@ -33,6 +33,7 @@ from neuros.control import (
     LiveCounters,
     Message,
     Metrics,
+    NodeProbe,
     NodeStatus,
     Probed,
     Report,
@@ -83,6 +84,7 @@ RICH = [
     Finalising("a", None),
     Advance(7, 2, {"a.o": 3}),
     AtRest(7, {"a": 0.25}, {"a.o": (4, [bytes(200_000), b"x"]), "a.p": (1, [b""])}),
+    Probed(7, {"a": NodeProbe(sent={"c": (3, 2)}, unread=frozenset({"d"}))}, {"a.o": (1, [b""])}),
 ]
 
 
@@ -184,12 +186,6 @@ def test_text_of_another_protocol_is_refused_before_it_ends() -> None:
 def test_a_message_is_accepted_only_by_those_for_whom_it_is() -> None:
     with pytest.raises(ControlError, match="Invalid value 'stop'"):
         decode(to_bytes(control.Stop()), decoder_of(tuple(FROM_NODES)), "node 'a'")
-
-
-def test_a_probe_is_a_report() -> None:
-    probed = plain(Probed)
-    assert isinstance(probed, Report)
-    assert not isinstance(REPORT, Probed)
 
 
 def test_every_class_of_messages_has_a_sender() -> None:

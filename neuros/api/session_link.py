@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from neuros.api.live import LiveRun
 from neuros.api.run import Run
@@ -39,7 +40,6 @@ from neuros.project.suggest import did_you_mean
 from neuros.transport.messages import RosPackets
 
 _CONNECT_S = 0.01
-_Answer = TypeVar("_Answer")
 
 
 class HeldRun(Protocol):
@@ -186,16 +186,18 @@ class LaunchedRun:
     ) -> AtRest | None:
         self._number += 1
         self._send(Advance(self._number, rounds, known))
-        answer = self._answer(AtRest, lambda answer: answer.number == self._number, end_s)
-        if answer is not None:
-            self._answered = self._number
-        return answer
+        for message in self._messages(end_s):
+            if isinstance(message, AtRest) and message.number == self._number:
+                self._answered = self._number
+                return message
+        return None
 
     def run_for(self, duration_s: float, known: Mapping[str, int]) -> AtRest | None:
         self._send(Resume())
         try:
             with contextlib.suppress(TimeoutError):
-                self._wait_for(lambda _: False, time.monotonic() + duration_s)
+                for _ in self._messages(time.monotonic() + duration_s):
+                    pass
         finally:
             self._send(Pause())
         return self.advance(0, known)
@@ -218,8 +220,8 @@ class LaunchedRun:
         if (self.run_for(0.0, {}) if self.is_behind else self.advance(0, {})) is None:
             return False
         self._send(Reset(variables, {node: tuple(names) for node, names in keep.items()}))
-        answer = self._answer(WasReset, lambda _: True, None)
-        return answer is not None and not answer.why_not
+        answers = (each for each in self._messages() if isinstance(each, WasReset))
+        return any(not answer.why_not for answer in islice(answers, 1))
 
     def change(self, changes: Changes, *, only_checks: bool = False) -> AtRest | None:
         for node, (variables, parameters) in changes.items():
@@ -231,17 +233,16 @@ class LaunchedRun:
         self._send(Resume())
 
     def look(self) -> Sequence[NodeStatus] | None:
-        found: dict[str, NodeStatus] = {}
-
-        def is_last(message: Message) -> bool:
-            if isinstance(message, NodeStatus):
-                found[message.node] = message
-            return len(found) == self._nodes
-
         if not self.is_behind:  # else a round goes on, perhaps for ever
             self.advance(0, {})  # what was sent has arrived then
         self._send(GetStatus({}))
-        return [*found.values()] if self._wait_for(is_last, None) else None
+        found: dict[str, NodeStatus] = {}
+        for message in self._messages():
+            if isinstance(message, NodeStatus):
+                found[message.node] = message
+                if len(found) == self._nodes:
+                    return [*found.values()]
+        return None
 
     def stop(self, reason: str) -> None:
         self._live.stop(reason)
@@ -281,38 +282,20 @@ class LaunchedRun:
         if self._supervisor is not None:
             self._supervisor.send(message)
 
-    def _answer(
-        self, kind: type[_Answer], is_wanted: Callable[[_Answer], bool], end_s: float | None
-    ) -> _Answer | None:
-        """The next such message of a kind; ``None`` if the run has ended."""
-        answers: list[_Answer] = []
-
-        def is_answer(message: Message) -> bool:
-            if isinstance(message, kind) and is_wanted(message):
-                answers.append(message)
-            return bool(answers)
-
-        return answers[0] if self._wait_for(is_answer, end_s) else None
-
-    def _wait_for(self, is_wanted: Callable[[Message], bool], end_s: float | None) -> bool:
-        """Until such a message comes; ``False`` once the run has ended.
+    def _messages(self, end_s: float | None = None) -> Iterator[Message]:
+        """What the supervisor sends, until the run has ended.
 
         Raises:
-            TimeoutError: if neither comes until ``end_s`` (monotonic, seconds).
+            TimeoutError: if it has not ended until ``end_s`` (monotonic, seconds).
         """
-        while self._supervisor is not None:
+        is_over = False
+        while self._supervisor is not None and not is_over:
             left_ms = None if end_s is None else max(0.0, end_s - time.monotonic()) * 1e3
             if not self._arrivals.wait(left_ms):
                 raise TimeoutError(f"the run has not come to rest in time: {self.folder}")
             messages = self._supervisor.receive()
-            is_over = messages is None
-            for message in messages or ():
-                if is_wanted(message):
-                    return True
-                is_over = is_over or isinstance(message, Ended)
-            if is_over:
-                break
-        return False
+            is_over = messages is None or any(isinstance(each, Ended) for each in messages)
+            yield from messages or ()
 
 
 def with_session_inputs(project: Project, taken: Sequence[str]) -> tuple[Project, tuple[str, ...]]:

@@ -164,21 +164,50 @@ class Report(Message, kw_only=True):
     virtual_s: float | None = None
 
 
-class Probed(Report, kw_only=True):
-    """Report of a node between two events, in answer to ``probe``.
+class NodeProbe(
+    msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True
+):
+    """Where a node stands between two events.
+
+    At the end of a step it tells no more than counters of connections to other processes, its
+    simulated time and whether it is active.
 
     Attributes:
-        number: that of the probe.
+        sent: by connection, packets sent and acknowledged.
+        received: by connection, likewise.
+        unread: the connections with packets that no hook has started on.
+        executions: of all hooks.
+        lacks: the input that it waits for, empty if there is none.
+        sim_time: simulated seconds, ``None`` where the node owns no time.
+        is_active: whether it has found its receivers, and may start all its hooks.
         is_startable: whether a hook could start on a packet that has arrived.
         is_wakeable: whether a timer, a thread or an external input may wake the node.
-        is_idle: whether no event waits.
+        is_idle: whether no event waits in its process.
+        is_virtual: whether it runs in virtual time.
     """
 
-    metrics: Metrics  # without the default of a report
+    sent: Mapping[str, tuple[int, int]] = {}
+    received: Mapping[str, tuple[int, int]] = {}
+    unread: frozenset[str] = frozenset()
+    executions: int = 0
+    lacks: str = ""
+    sim_time: float | None = None
+    is_active: bool = True
+    is_startable: bool = False
+    is_wakeable: bool = False
+    is_idle: bool = True
+    is_virtual: bool = False
+
+
+class Probed(Message):
+    """Where the nodes of a process stand between two events, in answer to ``probe``.
+
+    ``packets``: as in ``at_rest``, of the outputs whose packets are asked for.
+    """
+
     number: int
-    is_startable: bool
-    is_wakeable: bool
-    is_idle: bool
+    nodes: Mapping[str, NodeProbe]
+    packets: Mapping[str, tuple[int, list[bytes]]] = {}
 
 
 class Ready(Message):
@@ -249,28 +278,17 @@ class NodeStatus(Message):
 
 
 class AtRest(Message):
-    """Nothing moves, and no hook may start: answer to `advance`.
-
-    Of a node process to the supervisor: no event waits there. Of the supervisor or the process with
-    all nodes to a session: in the whole run.
+    """Nothing moves in the run, and no hook may start: answer to `advance`.
 
     Attributes:
         sim_times: of nodes that own simulated time, in seconds.
         packets: by output (``robot.imu``), the number of its newest packet, from 1, and in their
             ROS serialisation, the packets after the known number, as far as they are kept.
-        nodes: of the process.
-        is_active: whether each node has found its receivers, and may start all its hooks.
-        sent: by connection to another process, packets sent and acknowledged; -1: it may lose some.
-        received: by connection from another process, likewise.
     """
 
     number: int
     sim_times: Mapping[str, float]
     packets: Mapping[str, tuple[int, list[bytes]]]
-    nodes: tuple[str, ...] = ()
-    is_active: bool = True
-    sent: Mapping[str, tuple[int, int]] = {}
-    received: Mapping[str, tuple[int, int]] = {}
 
 
 class WasReset(Message):
@@ -283,9 +301,16 @@ class WasReset(Message):
 
 
 class Probe(Message):
-    """Report between two events."""
+    """Tell between two events where the nodes stand.
+
+    Attributes:
+        once_idle: answer when no event waits in the process any more, unless it is resumed before.
+        known: outputs whose packets are asked for, and the number of the newest known packet.
+    """
 
     number: int
+    once_idle: bool = False
+    known: Mapping[str, int] = {}
 
 
 class Drain(Message):
@@ -455,7 +480,7 @@ class Ended(Message):
 
 FROM_NODES: Sequence[type[Message]] = (
     *(Hello, Ready, Report, Probed, Hooks, Finalising, Progress, Shutdown, Failed),
-    *(StateOfPeer, NodeStatus, AtRest, WasReset),
+    *(StateOfPeer, NodeStatus, WasReset),
 )
 TO_NODES: Sequence[type[Message]] = (
     *(
@@ -472,7 +497,7 @@ TO_NODES: Sequence[type[Message]] = (
         Step,
         GetStatus,
     ),
-    *(Advance, Deliver, Reset, Change),
+    *(Deliver, Reset, Change),
 )
 FROM_OBSERVERS: Sequence[type[Message]] = (
     *(Watch, GetStatus, Pause, Resume, Step, End, Interrupt, Advance, Deliver, Reset),

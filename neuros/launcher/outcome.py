@@ -1,17 +1,16 @@
-"""Phases of a run, its outcome, and its node processes as their reports show them."""
+"""Phases of a run, and its outcome."""
 
 from __future__ import annotations
 
 import signal
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from itertools import pairwise
 from typing import Any, Protocol
 
 from neuros.control import Report
-from neuros.launcher.stall_detector import StallDetector
 from neuros.ports import RunningNode
 
 EXIT_CODES = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGHUP: 143}
@@ -151,10 +150,6 @@ class Outcome:
             self.timelines.setdefault(name, []).extend(report.timeline)
             self.report_times_s[name] = now_s
 
-    def shift(self, still_s: float) -> None:
-        """The launcher stood still for so long, and perhaps the nodes: their reports are as new."""
-        self.report_times_s = {n: at_s + still_s for n, at_s in self.report_times_s.items()}
-
     def begin_to_end(self, now_s: float) -> None:
         """The end has been asked for; the first time counts."""
         if self.ending_s is None:
@@ -163,10 +158,6 @@ class Outcome:
     def has_final_report(self, name: str) -> bool:
         """Whether a node has come to its end."""
         return name in self.reports and self.reports[name].is_final
-
-    def final_report_s(self, name: str) -> float:
-        """When a node came to its end, on the monotonic clock; 0 if it has not."""
-        return self.report_times_s[name] if self.has_final_report(name) else 0.0
 
     def end_by_force(self, exit_code: int, name: str) -> None:
         """The user has had killed what was left of a run, by a signal of this name."""
@@ -200,71 +191,6 @@ def _simulated(timeline: Sequence[Sequence[float]], wall_s: float) -> float:
         return float(sim_s)
     next_sim_s, next_s = following[0]
     return float(sim_s + (next_sim_s - sim_s) * (wall_s - since_s) / (next_s - since_s))
-
-
-@dataclass
-class Processes:
-    """Processes that the back end has started, judged by the reports of their nodes.
-
-    Attributes:
-        failed: the nodes that have reported that they failed: their processes may end.
-        killed: the nodes whose processes were killed, or are to be.
-    """
-
-    _detector: StallDetector
-    _outcome: Outcome
-    _running: list[RunningNode] = field(default_factory=list)
-    failed: set[str] = field(default_factory=set)
-    killed: set[str] = field(default_factory=set)
-
-    def add(self, started: Sequence[RunningNode]) -> None:
-        """These run from now on."""
-        self._running += started
-
-    def __len__(self) -> int:
-        return len(self._running)
-
-    def __iter__(self) -> Iterator[RunningNode]:
-        return iter(tuple(self._running))
-
-    def ended(self) -> list[tuple[RunningNode, str]]:
-        """Processes that have ended since the last call, and how."""
-        ended = [(process, how) for process in self._running if (how := process.poll())]
-        for process, _ in ended:
-            self._running.remove(process)
-        return ended
-
-    def kill(self, process: RunningNode) -> None:
-        self.killed.update(process.names)
-        process.kill()
-
-    def with_node(self, name: str) -> RunningNode | None:
-        """The process with a node, if it runs."""
-        return next((each for each in self._running if name in each.names), None)
-
-    def may_end(self, process: RunningNode, *, is_stopping: bool) -> bool:
-        """Whether its nodes have made their final reports, or have reported a failure."""
-        names = set(process.names)
-        if names <= self.killed or names & self.failed:
-            return True
-        return is_stopping and all(map(self._outcome.has_final_report, names))
-
-    def how_it_failed(self, process: RunningNode, how: str, *, is_stopping: bool) -> str:
-        """One sentence about a process that should not have ended."""
-        if is_stopping:
-            when = "while finalising"
-        elif not any(map(self._detector.is_greeted, process.names)):
-            were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
-            when = f"before {were} wrote is above)"
-        else:
-            when = f"unexpectedly{''.join(map(self._detector.last_seen, process.names))}"
-        return f"{nodes_of(process)} ended {when}: {how}"
-
-    def how_it_left(self, process: RunningNode, how: str) -> str:
-        """One sentence about a process that ended badly after its final report, else empty."""
-        if how == "exit code 0" or {*process.names} & (self.killed | self.failed):
-            return ""
-        return f"the process of {nodes_of(process)} ended badly after its final report: {how}"
 
 
 def names_of(process: RunningNode) -> str:

@@ -10,15 +10,18 @@ from __future__ import annotations
 import json
 import math
 import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from enum import IntEnum
 from typing import Any, NamedTuple
 
-from neuros.control import Report
+from neuros.control import NodeProbe, Report
 from neuros.control.link import read_as
 from neuros.errors import ControlError
 from neuros.project.model import Connection, NodeFile
+
+Ends = Mapping[str, "tuple[int, int]"]
+"""By connection, packets that have passed at one of its ends, and those acknowledged."""
 
 Counters = Mapping[str, Mapping[str, Mapping[str, Mapping[str, Any]]]]
 """``counters[node]["outgoing" or "incoming"][connection]``: counters, as in a node's metrics."""
@@ -54,7 +57,8 @@ class PeerState:
         exit_code, reason: how it ends, from when it is to end on.
         origin: the machine on which the cause of that lies.
         drain_s: for how long it drains at most.
-        counters: of the connections between peers, when drained or over.
+        sent, received: of the connections between peers, when drained.
+        counters: of these, when over.
     """
 
     run: str
@@ -67,6 +71,8 @@ class PeerState:
     origin: str = ""
     drain_s: float = 0.0
     counters: Counters = field(default_factory=dict)
+    sent: Ends = field(default_factory=dict)
+    received: Ends = field(default_factory=dict)
 
     def to_text(self) -> str:
         """As it travels."""
@@ -102,14 +108,6 @@ def counters_of(reports: Mapping[str, Report], crossing: Sequence[Connection]) -
         for name, report in reports.items()
         if (metrics := report.metrics) is not None
     }
-
-
-def count(
-    counters: Counters, node: str, part: str, connection: Connection, what: str
-) -> int | None:
-    """One counter, ``None`` where it is not known."""
-    found = counters.get(node, {}).get(part, {}).get(str(connection), {}).get(what)
-    return None if found is None else int(found)
 
 
 class EndElsewhere(NamedTuple):
@@ -187,15 +185,19 @@ class Peers:
         """The run here drains."""
         self._publish(phase=DRAINING, drain_s=drain_s, **self._because(reason, 0))
 
-    def agree_on_end(self, probes: Mapping[str, Report]) -> bool:
+    def agree_on_end(self, probes: Mapping[str, NodeProbe]) -> bool:
         """The run here is drained by itself; returns whether peers agree, and nothing is under way.
 
         Others count it as drained only while the counters of both ends are equal. A packet under
         way shows in them (Mattern's counters, see :mod:`neuros.launcher.quiescence`).
         """
-        counters = counters_of(probes, self._crossing)
-        if (self._own.phase, self._own.counters) != (DRAINED, counters):
-            self._publish(phase=DRAINED, counters=counters)
+        ends = {
+            "sent": self._between_peers(probe.sent for probe in probes.values()),
+            "received": self._between_peers(probe.received for probe in probes.values()),
+        }
+        own = {"phase": self._own.phase, "sent": self._own.sent, "received": self._own.received}
+        if own != {"phase": DRAINED, **ends}:
+            self._publish(phase=DRAINED, **ends)
         return all(self._agrees(each) for each in self._others.values() if each.has_just_begun)
 
     def go_on(self) -> None:
@@ -312,16 +314,17 @@ class Peers:
         gone = {self._run_of[node] for node in self._gone_s}
         return any(s.phase != OVER and s.run not in gone for s in self._others.values())
 
+    def _between_peers(self, ends: Iterable[Ends]) -> Ends:
+        keys = {str(connection) for connection in self._crossing}
+        return {key: counts for each in ends for key, counts in each.items() if key in keys}
+
     def _agrees(self, other: PeerState) -> bool:
-        if other.phase != DRAINED:
-            return False
-        counters = {**self._own.counters, **other.counters}
-        return all(
-            count(counters, c.source_node, "outgoing", c, sent)
-            == count(counters, c.destination_node, "incoming", c, arrived)
-            for c in self._crossing
-            if c.is_reliable and _ends(c) & other.counters.keys()
-            for sent, arrived in (("sent", "received"), ("acknowledged", "acknowledged"))
+        sent = {**self._own.sent, **other.sent}
+        received = {**self._own.received, **other.received}
+        theirs = other.sent.keys() | other.received.keys()
+        return other.phase == DRAINED and all(
+            sent.get(key) == received.get(key)
+            for key in theirs.intersection(str(c) for c in self._crossing if c.is_reliable)
         )
 
 

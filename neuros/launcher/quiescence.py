@@ -1,8 +1,11 @@
-"""Judges from probes of all nodes whether a project is drained, or deadlocked.
+"""Judges from probes of all nodes whether a run is drained, deadlocked, or at the end of a step.
 
-A probe is a report that a node makes between two events. Probes of different nodes are not made at
-the same instant, so one round of them can miss a packet that is under way; two rounds with the same
-counters cannot (F. Mattern, "Algorithms for distributed termination detection", 1987).
+A probe tells where a node stands between two events. Probes of different nodes are not made at the
+same instant, so one round of them can miss a packet that is under way; two rounds with the same
+counters cannot (F. Mattern, "Algorithms for distributed termination detection", 1987). One round is
+enough where each process answers only once no event waits in it, and the run is paused: if
+something still moved, then some process was the first to receive a packet after its answer. That
+was sent before the answer of its sender, so the counters of this connection would differ.
 
 A loop in which every hook waits for the one before it never comes to rest by itself, so a drained
 end has to stop it after one more round. Which hooks these are follows from the declarations of
@@ -12,19 +15,21 @@ run.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from enum import Enum
 from typing import Any, TypeVar
 
 from neuros.control import (
+    Advance,
+    AtRest,
     HookDeclaration,
     Hooks,
     Message,
+    NodeProbe,
     Probe,
     Probed,
-    ReceivedCounts,
-    SentCounts,
 )
 from neuros.hooks import HookKind, InputSpec
 from neuros.launcher.peers import Peers
@@ -33,16 +38,13 @@ from neuros.project.model import Connection, NodeFile
 DEADLOCK_AFTER_S = 1.0
 """Nothing must have moved for this long before nodes are asked whether anything ever will."""
 
-_DRAINING_PAUSE_S = 0.01
-# Two rounds tell a deadlock. Where they told that somebody may wake a node, the answers of the
-# next rounds will hardly differ, so these come more and more rarely until something has moved.
-_RUNNING_PAUSE_S = DEADLOCK_AFTER_S / 2
-_LONGEST_PAUSE_S = 2.0
 _BUSY_S = 0.1
+_LOST_AFTER_S = 0.1
+"""On a connection that may lose packets, one that has not arrived for so long has been lost."""
 
 _T = TypeVar("_T")
 
-Probes = Mapping[str, Probed]
+Probes = Mapping[str, NodeProbe]
 """The newest probe by node."""
 
 Waits = Mapping[str, Mapping[str, str]]
@@ -50,21 +52,38 @@ Waits = Mapping[str, Mapping[str, str]]
 
 
 class Verdict(Enum):
-    """Conclusion from a round of probes."""
+    """Conclusion from the rounds of probes."""
 
     UNDECIDED = "undecided"
     DRAINED = "drained"
     DEAD = "dead"
+    AT_REST = "at rest"
+
+
+# Seconds between the first two rounds, and at most: the pause doubles. Two rounds tell a deadlock;
+# where they told that somebody may wake a node, the answers of the next ones will hardly differ.
+_PAUSES_S = {
+    Verdict.DRAINED: (0.01, 0.01),
+    Verdict.DEAD: (DEADLOCK_AFTER_S / 2, 2.0),
+    Verdict.AT_REST: (0.0005, 0.02),
+}
 
 
 class Probing:
-    """Finds out whether a project is drained or dead.
+    """Finds out whether a run is dead, drained, or at the end of a step, whichever is asked for.
+
+    All times are seconds on one monotonic clock.
 
     Args:
         names: the nodes, all of which have to answer.
         connections: those among them.
         send: sends to all processes.
         peers: who has to agree that the project is drained, where not all nodes are here.
+        are_there: whether the processes of all nodes have connected.
+
+    Attributes:
+        verdict: what was found, until something else is asked for.
+        due_s: when :meth:`check` has something to do in a run that drains or stands still.
     """
 
     def __init__(
@@ -73,46 +92,70 @@ class Probing:
         connections: Sequence[Connection],
         send: Callable[[Message], object],
         peers: Peers | None = None,
+        are_there: Callable[[], bool] = lambda: True,
     ) -> None:
         self._names = set(names)
         self._connections = connections
         self._send = send
         self._peers = peers
-        self._is_draining = False
+        self._are_there = are_there
+        self._goal = Verdict.DEAD
         self._number = 0
         self._asked_s = 0.0
+        self._next_s = 0.0  # infinite while answers are awaited
         self._pause_s = 0.0
-        self._probes: dict[str, Probed] = {}
+        self._probes: dict[str, NodeProbe] = {}
         self._answers: Probes = {}  # of the last whole round
         self._last_round: tuple[Any, ...] | None = None
+        self._same_since_s = 0.0
+        self._step = Advance(0, 0, {})
+        self._packets: dict[str, tuple[int, list[bytes]]] = {}
         self.verdict = Verdict.UNDECIDED
+
+    @property
+    def due_s(self) -> float:
+        return math.inf if self._goal is Verdict.DEAD else self._next_s
 
     def drain(self, without: Iterable[str], now_s: float) -> None:
         """From now on find out when the nodes, ``without`` those that never began, are drained."""
-        self._is_draining = True
         self._names.difference_update(without)
-        self._last_round = None
-        self.verdict = Verdict.UNDECIDED if self._names else Verdict.DRAINED
-        self._ask(now_s)
+        self._seek(Verdict.DRAINED, now_s)
+        if not self._names:
+            self.verdict = Verdict.DRAINED
 
-    def add(self, probe: Probed) -> None:
-        """An answer has arrived, perhaps to the last probe."""
-        if probe.number == self._number and probe.node in self._names:
-            self._probes[probe.node] = probe
-            if len(self._probes) == len(self._names):
-                self._judge()
+    def await_rest(self, step: Advance, now_s: float) -> None:
+        """Find out when a step is over; what was asked before is answered no more."""
+        if self._goal is not Verdict.DRAINED:
+            self._step = step
+            self._packets = {}
+            self._seek(Verdict.AT_REST, now_s)
+
+    def end_rest(self) -> AtRest:
+        """The answer to the session, once it is at rest or waits for that no more."""
+        nodes = self._answers.items()
+        times = {name: probe.sim_time for name, probe in nodes if probe.sim_time is not None}
+        if self._goal is Verdict.AT_REST:
+            self._goal, self._pause_s, self._last_round = Verdict.DEAD, 0.0, None
+            self.verdict = Verdict.UNDECIDED
+        return AtRest(self._step.number, times, self._packets)
+
+    def add(self, probed: Probed, now_s: float) -> None:
+        """An answer of a process has arrived, perhaps to the last round."""
+        if probed.number != self._number:
+            return
+        for output, (number, contents) in probed.packets.items():
+            _, before = self._packets.get(output, (0, []))
+            self._packets[output] = number, before + contents
+        self._probes |= {n: each for n, each in probed.nodes.items() if n in self._names}
+        if len(self._probes) == len(self._names) and self._next_s == math.inf:
+            self._judge(now_s)
+            self._wait(now_s)
 
     def check(self, now_s: float, rested_s: float) -> Verdict:
         """Ask again where it is time; ``rested_s`` is for how long nothing has moved."""
-        pause_s = now_s - self._asked_s
-        if self._is_draining:
-            has_answers = len(self._probes) == len(self._names)
-            if has_answers and pause_s >= _DRAINING_PAUSE_S and self.verdict is Verdict.UNDECIDED:
-                self._ask(now_s)
-        elif rested_s < DEADLOCK_AFTER_S:
-            self._pause_s = 0.0
-        elif pause_s >= self._pause_s:
-            self._pause_s = min(max(2 * self._pause_s, _RUNNING_PAUSE_S), _LONGEST_PAUSE_S)
+        if self._goal is Verdict.DEAD and rested_s < DEADLOCK_AFTER_S:
+            self._pause_s, self._next_s = 0.0, now_s
+        elif self.verdict is Verdict.UNDECIDED and now_s >= self._next_s:
             self._ask(now_s)
         return self.verdict
 
@@ -150,25 +193,46 @@ class Probing:
             *(f"{name} has a packet to work on" for name in waiting),
         ]
 
-    def _ask(self, now_s: float) -> None:
-        self._number += 1
-        self._asked_s = now_s
-        self._probes = {}
-        self._send(Probe(self._number))
+    def _seek(self, goal: Verdict, now_s: float) -> None:
+        self._goal = goal
+        self._pause_s, self._last_round = 0.0, None
+        self.verdict = Verdict.UNDECIDED
+        self._ask(now_s)
 
-    def _judge(self) -> None:
-        probes, connections = self._probes, self._connections
+    def _ask(self, now_s: float) -> None:
+        """Begin a round; a step that is asked for early waits until all nodes are there."""
+        is_step = self._goal is Verdict.AT_REST
+        if is_step and not self._are_there():
+            self._wait(now_s)
+            return
+        self._number += 1
+        self._asked_s, self._next_s = now_s, math.inf
+        self._probes = {}
+        newest = {output: number for output, (number, _) in self._packets.items()}
+        known = {**self._step.known, **newest} if is_step else {}
+        self._send(Probe(self._number, once_idle=is_step, known=known))
+
+    def _wait(self, now_s: float) -> None:
+        first_s, longest_s = _PAUSES_S[self._goal]
+        self._pause_s = min(max(2 * self._pause_s, first_s), longest_s)
+        self._next_s = now_s + self._pause_s
+
+    def _judge(self, now_s: float) -> None:
+        goal, probes, connections = self._goal, self._probes, self._connections
         self._answers = probes
-        if self._is_draining:
-            this_round: tuple[Any, ...] = reliable_counters(probes, connections)
-            is_over, verdict = is_drained(probes, connections), Verdict.DRAINED
-        else:
-            this_round = counters(probes)
-            is_over, verdict = is_dead(probes, connections), Verdict.DEAD
-        is_stable, self._last_round = this_round == self._last_round, this_round
-        if is_over and is_stable and (self._peers is None or self._peers.agree_on_end(probes)):
-            self.verdict = verdict
-        elif self._peers is not None and not (is_over and is_stable):
+        is_drain = goal is Verdict.DRAINED
+        this_round = reliable_counters(probes, connections) if is_drain else counters(probes)
+        is_stable = this_round == self._last_round
+        if not is_stable:
+            self._last_round, self._same_since_s = this_round, now_s
+        if goal is Verdict.AT_REST:
+            if is_at_rest(probes, connections, now_s - self._same_since_s):
+                self.verdict = goal
+            return
+        is_over = is_stable and (is_drained if is_drain else is_dead)(probes, connections)
+        if is_over and (self._peers is None or self._peers.agree_on_end(probes)):
+            self.verdict = goal
+        elif self._peers is not None and not is_over:
             self._peers.go_on()
 
 
@@ -186,32 +250,15 @@ def connections_among(files: Sequence[NodeFile]) -> list[Connection]:
 
 def counters(probes: Probes) -> tuple[Any, ...]:
     """All that happens in a project, counted: it rests if this stays the same."""
-    return tuple(
-        (
-            name,
-            tuple(
-                (key, c["sent"], c["acknowledged"])
-                for key, c in sorted(probe.metrics["outgoing"].items())
-            ),
-            tuple(
-                (key, c["received"], c["acknowledged"])
-                for key, c in sorted(probe.metrics["incoming"].items())
-            ),
-            tuple(
-                (key, hook["executions"]) for key, hook in sorted(probe.metrics["hooks"].items())
-            ),
-        )
-        for name, probe in sorted(probes.items())
-    )
+    return tuple((n, p.executions, p.sent, p.received) for n, p in sorted(probes.items()))
 
 
-def reliable_counters(
-    probes: Probes, connections: Sequence[Connection]
-) -> tuple[tuple[int, ...], ...]:
+def reliable_counters(probes: Probes, connections: Sequence[Connection]) -> tuple[Any, ...]:
     """All that happens on reliable connections, counted; packets that may be lost flood on."""
     return tuple(
-        (outgoing["sent"], outgoing["acknowledged"], incoming["received"], incoming["acknowledged"])
-        for _, outgoing, incoming in _reliable(probes, connections)
+        (sent, received)
+        for connection, sent, received in _ends(probes, connections)
+        if connection.is_reliable
     )
 
 
@@ -219,9 +266,8 @@ def under_way(probes: Probes, connections: Sequence[Connection]) -> list[str]:
     """Reliable connections with a packet or an acknowledgement that has not arrived."""
     return [
         str(connection)
-        for connection, outgoing, incoming in _reliable(probes, connections)
-        if outgoing["sent"] != incoming["received"]
-        or outgoing["acknowledged"] != incoming["acknowledged"]
+        for connection, sent, received in _ends(probes, connections)
+        if connection.is_reliable and sent != received
     ]
 
 
@@ -231,8 +277,7 @@ def is_drained(probes: Probes, connections: Sequence[Connection]) -> bool:
     In virtual time, all that happens counts, so no packet at all may be under way.
     """
     return not under_way(probes, connections) and not any(
-        probe.is_startable or (probe.virtual_s is not None and not probe.is_idle)
-        for probe in probes.values()
+        probe.is_startable or (probe.is_virtual and not probe.is_idle) for probe in probes.values()
     )
 
 
@@ -240,6 +285,22 @@ def is_dead(probes: Probes, connections: Sequence[Connection]) -> bool:
     """Whether no node can ever run a hook again."""
     return not under_way(probes, connections) and all(
         probe.is_idle and not probe.is_wakeable for probe in probes.values()
+    )
+
+
+def is_at_rest(probes: Probes, connections: Sequence[Connection], same_s: float) -> bool:
+    """Whether nothing moves in a paused run whose nodes have all been started.
+
+    ``same_s``: for how long the counters have been the same, in seconds.
+    """
+    under_way = [
+        connection.is_reliable
+        for connection, sent, received in _ends(probes, connections)
+        if (sent != received if connection.is_reliable else sent[0] != received[0])
+    ]
+    has_lost = bool(under_way) and not any(under_way)
+    return all(probe.is_active for probe in probes.values()) and (
+        not under_way or (has_lost and same_s >= _LOST_AFTER_S)
     )
 
 
@@ -251,19 +312,18 @@ def waits(probes: Probes, connections: Sequence[Connection]) -> dict[str, dict[s
         sender, receiver = connection.source_node, connection.destination_node
         if sender not in probes or receiver not in probes:
             continue
-        state = probes[receiver].metrics["state"]
-        is_waiting = state["state"] == "waiting"
-        outgoing = probes[sender].metrics["outgoing"][key]
+        lacks = probes[receiver].lacks
+        sent, acknowledged = probes[sender].sent[key]
+        outstanding = sent - acknowledged
         # A packet to itself stays unread for as long as the node waits for another input: then
         # it is that input that it lacks.
-        if outgoing["is_blocked"] and not (sender == receiver and is_waiting):
-            outstanding = outgoing["outstanding"]
+        is_blocked = connection.is_reliable and outstanding >= connection.window
+        if is_blocked and not (sender == receiver and lacks):
             result[sender].setdefault(
                 receiver, f"is blocked on `{key}` ({outstanding} outstanding)"
             )
-        is_cause = is_waiting and state["cause"] == connection.destination_input
-        if is_cause and not probes[receiver].metrics["incoming"][key]["unread"]:
-            result[receiver][sender] = f"waits for `{connection.destination_input}` from {sender}"
+        if lacks == connection.destination_input and key not in probes[receiver].unread:
+            result[receiver][sender] = f"waits for `{lacks}` from {sender}"
     return result
 
 
@@ -300,16 +360,17 @@ def _ring_through(start: _T, following: Callable[[_T], Iterable[_T]]) -> list[_T
     return []
 
 
-def _reliable(
+def _ends(
     probes: Probes, connections: Sequence[Connection]
-) -> Iterator[tuple[Connection, SentCounts, ReceivedCounts]]:
-    """The counters at both ends of every reliable connection between nodes that were probed."""
+) -> Iterator[tuple[Connection, tuple[int, int], tuple[int, int]]]:
+    """The counters at both ends of every connection between nodes that tell them."""
     for connection in connections:
         sender = probes.get(connection.source_node)
         receiver = probes.get(connection.destination_node)
-        if connection.is_reliable and sender and receiver:
+        if sender and receiver and sender.sent:
             key = str(connection)
-            yield (connection, sender.metrics["outgoing"][key], receiver.metrics["incoming"][key])
+            if key in sender.sent:
+                yield connection, sender.sent[key], receiver.received[key]
 
 
 class DeclaredHook(HookDeclaration, frozen=True):

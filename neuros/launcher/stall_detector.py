@@ -6,10 +6,11 @@ Reports come once per second, so what is said here is up to a second late.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-from neuros.control import ExecutingHook, Report
+from neuros.control import Report
+from neuros.launcher.nodes import NodeView
 from neuros.launcher.thread_reader import ThreadReader
 from neuros.project.model import Connection
 from neuros.stacks import IMPORT, LONG_S, ProcessThreads, Stack
@@ -35,26 +36,14 @@ class StallDetector:
     """Finds standstills, long hooks and silent nodes.
 
     Args:
-        names: the nodes.
+        nodes: by name.
         now_s: the time now; all times are seconds on one monotonic clock.
         reader: reads where the threads of processes stand.
-
-    Attributes:
-        loaded: the nodes whose plugins have been imported.
-        ready: the nodes that have initialised as far as they can alone.
     """
 
-    def __init__(self, names: Sequence[str], now_s: float, reader: ThreadReader) -> None:
-        self._names = tuple(names)
+    def __init__(self, nodes: Mapping[str, NodeView], now_s: float, reader: ThreadReader) -> None:
+        self._nodes = nodes
         self._reader = reader
-        self._processes: dict[str, tuple[str, ...]] = {}  # by node, all nodes of its process
-        self._plugins: dict[str, str] = {}
-        self._silent = set(names)
-        self.loaded: set[str] = set()
-        self.ready: set[str] = set()
-        self._reports: dict[str, Report] = {}
-        self._heard_s: dict[str, float] = {}
-        self._moved: dict[str, Any] = {}
         self._moved_s = now_s
         self._has_explained = False
         self._named_hooks: set[tuple[str, str, int]] = set()
@@ -64,32 +53,19 @@ class StallDetector:
         self._starving: dict[str, tuple[str, float]] = {}  # by node, what it lacks, since when
         self._named_as_starving: set[tuple[str, str]] = set()
 
-    def greet(self, names: Sequence[str], plugins: Mapping[str, str], now_s: float) -> None:
-        """These nodes' process is there, with these files of plugins."""
-        self._silent.difference_update(names)
-        for name in names:
-            self._processes[name] = tuple(names)
-            self._heard_s.setdefault(name, now_s)
-            if name in plugins:
-                self._plugins[name] = plugins[name]
-
     def report(self, report: Report, now_s: float) -> None:
         """Add a report."""
-        name, metrics = report.node, report.metrics
-        self._reports[name] = report
-        self._heard_s[name] = now_s
-        self._reader.forget(self._together(name)[0])
+        name = report.node
+        node = self._nodes[name]
+        before = _movement(node.report)
+        node.report, node.heard_s = report, now_s
+        self._reader.forget(node.together[0])
         self._named_as_mute.discard(name)
         if name in self._named_as_held:
             self._named_as_held.remove(name)
-            if hook := self._executing(name):
+            if hook := node.executing:
                 self._named_hooks.add((name, hook["name"], hook["executions"]))
-        moved = metrics and (
-            [hook["executions"] for hook in metrics["hooks"].values()],
-            [c["received"] for c in metrics["incoming"].values()],
-        )
-        if self._moved.get(name) != moved:
-            self._moved[name] = moved
+        if before != _movement(report):
             self._moved_s = now_s
             self._has_explained = False
         lacks = _lacks(report)
@@ -98,24 +74,15 @@ class StallDetector:
         elif self._starving.get(name, ("",))[0] != lacks:
             self._starving[name] = lacks, now_s
 
-    def is_greeted(self, name: str) -> bool:
-        """Whether the process of a node has connected."""
-        return name not in self._silent
-
-    def has_begun(self, name: str) -> bool:
-        """Whether a node may run hooks."""
-        report = self._reports.get(name)
-        return report is not None and report.metrics is not None
-
     @property
     def is_complete(self) -> bool:
         """Whether all nodes have begun."""
-        return not self._silent and all(map(self.has_begun, self._names))
+        return all(node.is_there and node.has_begun for node in self._nodes.values())
 
     @property
     def is_driven(self) -> bool:
         """Whether some node starts hooks with no packet for them."""
-        return any(report.is_driving for report in self._reports.values())
+        return any(report.is_driving for _, report in self._reports())
 
     def begin_anew(self, now_s: float) -> None:
         """Something has kept the nodes still that is no standstill of their own."""
@@ -124,20 +91,18 @@ class StallDetector:
         self._starving.clear()
 
     def shift(self, still_s: float) -> None:
-        """The launcher stood still for so long: that was no silence or standstill of a node."""
-        self._heard_s = {name: heard_s + still_s for name, heard_s in self._heard_s.items()}
+        """The launcher stood still for so long: that was no standstill of the nodes."""
         self._moved_s += still_s
         self._next_remark_s += still_s
 
     def is_held_up(self, name: str, now_s: float) -> bool:
         """Whether a node cannot take in packets, which is said otherwise: a hook executes in its
         process, or it does not report."""
-        is_executing = any(map(self._executing, self._together(name)))
-        return is_executing or self.silent_s(name, now_s) >= SILENT_S
+        return self._is_busy(name) or self._nodes[name].silent_s(now_s) >= SILENT_S
 
     def rested_s(self, now_s: float) -> float:
         """For how long no hook has run and no packet has arrived; 0 while one executes."""
-        if any(self._executing(name) for name in self._reports):
+        if any(node.executing for node in self._nodes.values()):
             return 0.0
         return now_s - self._moved_s
 
@@ -155,26 +120,27 @@ class StallDetector:
 
     def reasons(self, now_s: float) -> Iterator[tuple[str, str]]:
         """Why nothing moves, by node; of a process that executes a hook, that is the reason."""
-        for name, report in sorted(self._reports.items()):
-            is_executing = any(map(self._executing, self._together(name)))
-            if report.reasons and not is_executing and self.silent_s(name, now_s) < SILENT_S:
+        for name, report in self._reports():
+            if report.reasons and not self.is_held_up(name, now_s):
                 yield "WARN", f"{name} {'; '.join(report.reasons)}"
 
     def remarks(self, now_s: float) -> Iterator[tuple[str, str]]:
         """Remarks for the user now, as ``(severity, text)``."""
         if now_s >= self._next_remark_s:
             self._next_remark_s = now_s + _NEXT_REMARK_S
-            if self._silent:
-                yield "INFO", f"still starting: {', '.join(sorted(self._silent))}"
-            early = [name for name in sorted(self._reports) if not self.has_begun(name)]
-            if loading := [name for name in early if name not in self.loaded]:
+            nodes = sorted(self._nodes.values(), key=lambda node: node.name)
+            if silent := [node.name for node in nodes if not node.is_there]:
+                yield "INFO", f"still starting: {', '.join(silent)}"
+            early = [node for node in nodes if node.report and not node.has_begun]
+            if loading := [node.name for node in early if not node.is_loaded]:
                 yield "INFO", f"still importing their plugins: {', '.join(loading)}"
             if waiting := self._waiting():
                 yield "INFO", f"connections still waiting for their other end: {'; '.join(waiting)}"
-            elif self.is_complete and not self.ready.issuperset(self._names):
-                initialising = [name for name in self._names if name not in self.ready]
+            elif not self.is_complete:
+                return
+            elif initialising := [node.name for node in nodes if not node.is_ready]:
                 yield "INFO", f"still initialising: {', '.join(initialising)}"
-            elif self.is_complete and self.rested_s(now_s) < STALL_S:  # else nodes are asked
+            elif self.rested_s(now_s) < STALL_S:  # else nodes are asked
                 for name, (lacks, since_s) in self._starving.items():
                     if now_s - since_s >= STALL_S and (name, lacks) not in self._named_as_starving:
                         self._named_as_starving.add((name, lacks))
@@ -182,31 +148,30 @@ class StallDetector:
 
     def remarks_on_hooks(self) -> Iterator[tuple[str, str]]:
         """Hooks that run for long, each once, with their stacks."""
-        for name in self._reports:
-            hook = self._executing(name)
+        for name, report in self._reports():
+            hook = self._nodes[name].executing
             if hook and hook["for_s"] >= LONG_S:
                 key = (name, hook["name"], hook["executions"])
                 if key not in self._named_hooks:
                     self._named_hooks.add(key)
                     text = f"{name} has been executing '{hook['name']}' for {LONG_S:g} s"
-                    yield "WARN", with_stack(text, self._reports[name].stack)
+                    yield "WARN", with_stack(text, report.stack)
 
-    def remarks_on_silence(
-        self, now_s: float, without: Collection[str] = ()
-    ) -> Iterator[tuple[str, str]]:
+    def remarks_on_silence(self, now_s: float) -> Iterator[tuple[str, str]]:
         """Processes that do not report, each once, and where they stand; not if they were killed.
 
         One that still imports only informs, and its stack is for the log.
 
         A process is read beside; the remark comes when that is there.
         """
-        for name, heard_s in self._heard_s.items():
-            if now_s - heard_s < LONG_S or name in self._named_as_mute or name in without:
+        for name, node in self._nodes.items():
+            silent_s = node.silent_s(now_s)
+            if silent_s < LONG_S or name in self._named_as_mute or node.is_killed:
                 continue
-            names = self._together(name)
+            names = node.together
             self._reader.begin(names[0])
             read = self._reader.read(names[0])
-            if read is None and now_s - heard_s < LONG_S + _READ_WITHIN_S:
+            if read is None and silent_s < LONG_S + _READ_WITHIN_S:
                 continue
             self._named_as_mute.update(names)
             read = read or _NOT_IN_TIME
@@ -218,7 +183,8 @@ class StallDetector:
     def _remark_on_import(self, names: Sequence[str], read: ProcessThreads) -> str:
         """A sentence about a process whose main thread, as it imports, lets no other thread run."""
         holder = read.lock_holder
-        loading = [n for n in names if n not in self.loaded and not self.has_begun(n)]
+        nodes = [self._nodes[name] for name in names]
+        loading = [node.name for node in nodes if not (node.is_loaded or node.has_begun)]
         stacks = filter(None, map(self._read_stack, names))
         if not (holder and holder.is_main and loading) or read.stopped:
             return ""
@@ -258,9 +224,10 @@ class StallDetector:
     def where(self, names: Sequence[str], now_s: float) -> tuple[dict[str, str], ProcessThreads]:
         """Where nodes of one process stand in their plugins, by name; and what was read of it."""
         read = self._reader.read(names[0]) or _NOT_IN_TIME
-        told = {name: self._reports[name].stack for name in names if name in self._reports}
+        reports = {name: self._nodes[name].report for name in names}
+        told = {name: report.stack for name, report in reports.items() if report}
         stacks = {name: self._read_stack(name) or told.get(name) for name in names}
-        holder, is_silent = read.lock_holder, self.silent_s(names[0], now_s) >= SILENT_S
+        holder, is_silent = read.lock_holder, self._nodes[names[0]].silent_s(now_s) >= SILENT_S
         if not is_silent:  # what it tells has the source lines
             stacks |= {name: stack for name, stack in told.items() if stack}
         found = {name: stack.text for name, stack in stacks.items() if stack}
@@ -273,21 +240,17 @@ class StallDetector:
 
         Of several nodes with one plugin in one process, it is of the one that was executing.
         """
-        names = self._together(name)
-        read, plugin = self._reader.read(names[0]), self._plugins.get(name)
-        if read is None or plugin is None:
+        node = self._nodes[name]
+        read = self._reader.read(node.together[0])
+        if read is None or not node.plugin:
             return None
-        alike = [each for each in names if self._plugins.get(each) == plugin]
-        last = next(filter(self._executing, alike), alike[0])
-        return read.hook_stack(name, plugin) if name == last else None
-
-    def silent_s(self, name: str, now_s: float) -> float:
-        """For how long a node has not reported."""
-        return now_s - self._heard_s.get(name, now_s)
+        alike = [n for n in map(self._nodes.__getitem__, node.together) if n.plugin == node.plugin]
+        last = next((each for each in alike if each.executing), alike[0])
+        return read.hook_stack(name, node.plugin) if node is last else None
 
     def executing(self, name: str) -> str:
         """The hook that a node executes, as far as is known; empty if there is none."""
-        hook = self._executing(name)
+        hook = self._nodes[name].executing
         if hook is not None:
             return hook["name"]
         stack = self._read_stack(name)
@@ -298,27 +261,35 @@ class StallDetector:
         hook = self.executing(name)
         return f", last seen executing '{hook}'" if hook else ""
 
-    def _together(self, name: str) -> tuple[str, ...]:
-        """The nodes of its process."""
-        return self._processes.get(name, (name,))
+    def _reports(self) -> list[tuple[str, Report]]:
+        return [(name, node.report) for name, node in sorted(self._nodes.items()) if node.report]
+
+    def _is_busy(self, name: str) -> bool:
+        """Whether a hook executes in the process of a node."""
+        return any(self._nodes[each].executing for each in self._nodes[name].together)
 
     def _is_named(self, name: str) -> bool:
         """Whether the hook that a node was executing when it reported last has been named."""
-        hook = self._executing(name)
+        hook = self._nodes[name].executing
         return hook is not None and (name, hook["name"], hook["executions"]) in self._named_hooks
 
     def _waiting(self) -> list[str]:
         """Connections whose other end has not been found yet; what carries packets has been."""
-        reports = [*self._reports.values()]
+        reports = [report for _, report in self._reports()]
         waiting = {key for report in reports for key in report.waiting_for}
         for metrics in (report.metrics for report in reports if report.metrics):
             waiting -= {key for key, counts in metrics["incoming"].items() if counts["received"]}
             waiting -= {key for key, sent in metrics["outgoing"].items() if sent["acknowledged"]}
         return sorted(waiting)
 
-    def _executing(self, name: str) -> ExecutingHook | None:
-        report = self._reports.get(name)
-        return report.metrics["executing"] if report and report.metrics else None
+
+def _movement(report: Report | None) -> Any:
+    """What changes when a hook has run or a packet has arrived."""
+    metrics = report and report.metrics
+    return metrics and (
+        [hook["executions"] for hook in metrics["hooks"].values()],
+        [counts["received"] for counts in metrics["incoming"].values()],
+    )
 
 
 def _lacks(report: Report) -> str:

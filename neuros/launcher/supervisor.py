@@ -23,14 +23,13 @@ import neuros.control as control
 from neuros.control import Message, Report
 from neuros.control.link import ControlLink
 from neuros.errors import ControlError
-from neuros.launcher.channels import Channels, Observers, PauseState, RestDetector
-from neuros.launcher.finalising import LEAVE_S, FinaliseTimes
+from neuros.launcher.channels import Channels, Observers, PauseState
+from neuros.launcher.nodes import LEAVE_S, NodeView, finalising, left_s
 from neuros.launcher.outcome import (
     EXIT_CODES,
     SIGNAL_NAMES,
     Outcome,
     Phase,
-    Processes,
     SupervisorOutput,
     names_of,
     nodes_of,
@@ -129,7 +128,10 @@ class Supervisor:
         self._duration_s = duration_s
         self._peers = peers or Peers("", (), files)
         self._on_stop = on_stop
-        self._names = frozenset(file.node.name for file in files)
+        self._nodes: dict[str, NodeView] = {}
+        for file in files:
+            name, limit_s = file.node.name, finalise_s or file.node.finalise_s
+            self._nodes[name] = NodeView(name, limit_s, run_folder / name)
         connections = connections_among(files)
 
         self.phase = Phase.STARTING
@@ -138,16 +140,22 @@ class Supervisor:
         if waker is not None:
             self._channels.wake_on(waker)
         self._peers.publish_through(lambda text: self._channels.send(control.PublishState(text)))
-        self._reader = ThreadReader(lambda name: self._processes.with_node(name))
-        self._detector = StallDetector(sorted(self._names), time.monotonic(), self._reader)
-        self._processes = Processes(self._detector, self.outcome)
+        self._processes: list[RunningNode] = []  # that run
+        self._reader = ThreadReader(
+            lambda name: next((each for each in self._processes if name in each.names), None)
+        )
+        self._detector = StallDetector(self._nodes, time.monotonic(), self._reader)
         self._backlog = Backlog(connections, self._detector.is_held_up)
         peers_to_ask = self._peers if self._peers.exist else None
-        self._probing = Probing(self._names, connections, self._channels.send, peers_to_ask)
+        self._probing = Probing(
+            self._nodes,
+            connections,
+            self._channels.send,
+            peers_to_ask,
+            lambda: all(node.is_there for node in self._nodes.values()),
+        )
+        self._session: ControlLink | None = None  # it waits for the end of a step
         self._declarations = Declarations(files)
-        limits_s = {file.node.name: finalise_s or file.node.finalise_s for file in files}
-        self._finalising = FinaliseTimes(limits_s, run_folder)
-        self._rest_detector = RestDetector(self._names, self._channels)
         self.pause = PauseState(self._channels.send, time.monotonic)
         if is_held:
             self.pause.begin()
@@ -187,16 +195,15 @@ class Supervisor:
         try:
             self._handle_requests()  # one may have come before anything was started
             if self.phase is Phase.STARTING:
-                self._processes.add(self._launcher.start(self._files, self._environment))
+                self._processes = [*self._launcher.start(self._files, self._environment)]
             has_shown = True
             self._last_tick_s = time.monotonic()
             while self._processes and not self._is_hopeless:
-                self._channels.wait(min(self._pause_s(has_shown), self._rest_detector.wait_s))
+                self._channels.wait(self._pause_s(has_shown))
                 self._handle_requests()
                 self._receive()
                 self._check_processes()
                 self._tick()
-                self._rest_detector.check()
                 self._channels.flush()
                 has_shown = bool(self._output.poll())
         finally:
@@ -265,30 +272,42 @@ class Supervisor:
 
     def _on_message(self, link: ControlLink, message: Message) -> None:
         now_s = time.monotonic()
+        if (senders := self._channels.nodes_of(link)) and not isinstance(
+            message, control.StateOfPeer
+        ):
+            for name in (*senders, getattr(message, "node", "")):
+                if name and name not in self._nodes:
+                    raise ControlError(f"this run has no node '{name}'")
         match message:
             case Report():
                 self._extend_drain(message, now_s)
                 self.outcome.add(message, now_s)
                 self._detector.report(message, now_s)
                 self._backlog.report(message, now_s)
-                if isinstance(message, control.Probed):
-                    self._probing.add(message)
+            case control.Probed():
+                self._probing.add(message, now_s)
+                if self._session is not None and self._probing.verdict is Verdict.AT_REST:
+                    # A pause takes back what hooks could not use of a step.
+                    self._channels.send(control.Pause())
+                    self._channels.send_to(self._session, self._probing.end_rest())
+                    self._session = None
             case control.Hello(nodes, plugins):
-                self._detector.greet(nodes, plugins, now_s)
+                for name in nodes:
+                    self._nodes[name].connect(nodes, plugins, now_s)
                 if self._peers.exist:
                     self._channels.send_to(link, control.PublishState(self._peers.own_state))
                 if self.pause.is_on:
                     self._channels.send_to(link, control.Pause())
             case control.Ready(node):
-                self._detector.ready.add(node)
+                self._nodes[node].is_ready = True
             case control.Hooks(node):
                 self._declarations.add(message)
-                self._finalising.declare(node, message.finalise)
-                self._detector.loaded.add(node)
+                self._nodes[node].hooks_left = list(message.finalise)
+                self._nodes[node].is_loaded = True
             case control.Finalising(node, hook):
-                self._finalising.enter(node, hook, now_s)
+                self._nodes[node].enter(hook, now_s)
             case control.Progress(node, text):
-                self._finalising.advance(node, now_s)
+                self._nodes[node].advance(now_s)
                 if text and now_s - self._told_s.get(node, 0.0) >= _TELL_S:
                     self._told_s[node] = now_s
                     self._log("INFO", f"{node}: {text}")
@@ -298,20 +317,21 @@ class Supervisor:
                 self._handle(RunEvent.END, why, drain_s, node, True)
             case control.Failed(node, text):
                 # Of a run that ends well, the failure of a node that was killed does not matter.
-                if self.outcome.failures or node not in self._processes.killed:
-                    self._processes.failed.add(node)
+                if self.outcome.failures or not self._nodes[node].is_killed:
+                    self._nodes[node].has_failed = True
                     first_line = (text.strip() or "no reason was given").splitlines()[0]
                     self._fail(f"node '{node}' failed: {first_line}")
             case control.StateOfPeer(node, text):
                 self._peers.receive(node, text, now_s)
             case control.Advance():
                 self.pause.step(message.rounds, is_driven=self._detector.is_driven)
-                self._rest_detector.ask(link, message)
-            case control.AtRest():
                 if self.phase in _BEFORE_END:  # else the session hears of the end
-                    self._rest_detector.add(message)
+                    self._session = link
+                    self._probing.await_rest(message, now_s)
             case control.Resume():
-                self._rest_detector.give_up(link)
+                if link is self._session:
+                    self._session = None
+                    self._probing.end_rest()
                 self.observers.receive(link, message)
             case control.Interrupt():
                 self._signals.append(signal.SIGINT)
@@ -321,18 +341,20 @@ class Supervisor:
     # ------------------------------------------------------------------ processes
 
     def _check_processes(self) -> None:
-        ended = self._processes.ended()
+        ended = [(process, how) for process in self._processes if (how := process.poll())]
         if ended:
+            gone = [process for process, _ in ended]
+            self._processes = [each for each in self._processes if each not in gone]
             self._receive()  # what they said last has arrived by now
         for process, how in ended:
-            is_stopping = self.phase is Phase.STOPPING
-            if not self._processes.may_end(process, is_stopping=is_stopping):
-                self._fail(
-                    self._processes.how_it_failed(process, how, is_stopping=is_stopping),
-                    exit_code=4 if process.is_abandoned else 1,
-                )
-            elif text := self._processes.how_it_left(process, how):
-                self._log("WARN", text)
+            if not self._may_end(process, is_stopping=self.phase is Phase.STOPPING):
+                text = f"{nodes_of(process)} ended {self._when_it_ended(process)}: {how}"
+                self._fail(text, exit_code=4 if process.is_abandoned else 1)
+            elif how != "exit code 0" and not any(
+                node.is_killed or node.has_failed for node in self._nodes_of(process)
+            ):
+                text = f"the process of {nodes_of(process)} ended badly after its final report"
+                self._log("WARN", f"{text}: {how}")
 
         for process in self._processes:
             if self._is_cut_off(process):
@@ -343,11 +365,26 @@ class Supervisor:
                     " opened?"
                 )
 
+    def _may_end(self, process: RunningNode, *, is_stopping: bool) -> bool:
+        """Whether its nodes have made their final reports, or have reported a failure."""
+        if self._is_killed(process) or any(node.has_failed for node in self._nodes_of(process)):
+            return True
+        return is_stopping and all(map(self.outcome.has_final_report, process.names))
+
+    def _when_it_ended(self, process: RunningNode) -> str:
+        """When a process has ended that should not have."""
+        if self.phase is Phase.STOPPING:
+            return "while finalising"
+        if any(node.is_there for node in self._nodes_of(process)):
+            return f"unexpectedly{''.join(map(self._detector.last_seen, process.names))}"
+        were = "it was up (what it" if len(process.names) == 1 else "they were up (what they"
+        return f"before {were} wrote is above)"
+
     def _is_cut_off(self, process: RunningNode) -> bool:
         """Whether a process runs on without its control connection, before its final reports."""
         for names, since_s in self._channels.parted.items():
             if {*names} & {*process.names} and time.monotonic() - since_s > _PARTED_S:
-                return not self._processes.may_end(process, is_stopping=True)
+                return not self._may_end(process, is_stopping=True)
         return False
 
     def _kill(self, processes: Sequence[RunningNode]) -> None:
@@ -357,7 +394,8 @@ class Supervisor:
         now_s = time.monotonic()
         stood = [(process, *self._detector.where(process.names, now_s)) for process in processes]
         for process in processes:
-            self._processes.kill(process)
+            self._mark_as_killed(process)
+            process.kill()
         for process, texts, read in stood:
             if at_it := self._finalising_in(process):  # others may be of the same plugin
                 texts = {name: text for name, text in texts.items() if name == at_it}
@@ -372,6 +410,17 @@ class Supervisor:
                 self._log("WARN", text)
             self.outcome.stacks.update(texts)
 
+    def _mark_as_killed(self, process: RunningNode) -> None:
+        for node in self._nodes_of(process):
+            node.is_killed = True
+
+    def _is_killed(self, process: RunningNode) -> bool:
+        return all(node.is_killed for node in self._nodes_of(process))
+
+    @property
+    def _killed(self) -> list[str]:
+        return [node.name for node in self._nodes.values() if node.is_killed]
+
     def _begin_to_read(self, processes: Sequence[RunningNode]) -> None:
         for process in processes:
             self._reader.begin(process.names[0])
@@ -380,9 +429,12 @@ class Supervisor:
 
     def _pause_s(self, has_shown: bool) -> float:
         """Seconds until the next tick; ``has_shown``: nodes are logging now."""
-        if has_shown or self.phase not in _BEFORE_END:
-            return _TICK_S
-        return min(_QUIET_TICK_S, max(0.0, self._end_s - time.monotonic()))
+        is_busy = has_shown or self.phase not in _BEFORE_END
+        longest_s = _TICK_S if is_busy else _QUIET_TICK_S
+        if self.phase not in _BEFORE_STOP:
+            return longest_s
+        due_s = min(self._probing.due_s, math.inf if is_busy else self._end_s)
+        return min(longest_s, max(0.0, due_s - time.monotonic()))
 
     @property
     def _end_s(self) -> float:
@@ -399,8 +451,8 @@ class Supervisor:
             self._detector.shift(still_s)
             self._backlog.begin_anew()
             self._deadline_s += still_s
-            self._finalising.shift(still_s)
-            self.outcome.shift(still_s)
+            for node in self._nodes.values():
+                node.shift(still_s)
         if end := self._peers.end(now_s):
             self._handle(RunEvent.ENDED_ELSEWHERE, end)
         self._handle(RunEvent.TICK, now_s)
@@ -411,7 +463,7 @@ class Supervisor:
             self.outcome.ending_s = self.pause.since_s
         self._show(self._detector.remarks_on_hooks())
         if self.phase in _BEFORE_STOP:
-            self._show(self._detector.remarks_on_silence(now_s, self._processes.killed))
+            self._show(self._detector.remarks_on_silence(now_s))
         # To observers, a run that starts is running.
         self.observers.update(Phase.RUNNING if self.phase is Phase.STARTING else self.phase)
 
@@ -426,12 +478,12 @@ class Supervisor:
 
     def _tick_starting(self, now_s: float) -> None:
         """Every plugin loads, here and at peers; then nodes initialise; then the run begins."""
-        if self._detector.loaded >= self._names:
+        if all(node.is_loaded for node in self._nodes.values()):
             self._peers.reach(Stage.LOADED)
             if not self._has_begun and self._peers.have_reached(Stage.LOADED):
                 self._has_begun = True
                 self._channels.send(control.Begin())
-        if self._detector.ready >= self._names:
+        if all(node.is_ready for node in self._nodes.values()):
             self._peers.reach(Stage.READY)
             if self._peers.have_reached(Stage.READY):
                 self._begin_to_run(now_s)
@@ -451,6 +503,8 @@ class Supervisor:
     def _tick_running(self, now_s: float) -> None:
         if self.phase not in _BEFORE_END:
             return
+        if self._session is not None:
+            self._probing.check(now_s, 0.0)
         if self.pause.is_on:
             self._detector.begin_anew(now_s)
             self._backlog.begin_anew()
@@ -493,7 +547,7 @@ class Supervisor:
         self._log("INFO", f"{reason}; letting packets under way arrive")
         self._peers.drain(reason, drain_s)
         self._channels.send(control.Drain(self._declarations.last_round(stopped), is_asked))
-        self._probing.drain(self._processes.killed, now_s)
+        self._probing.drain(self._killed, now_s)
 
     def _extend_drain(self, report: Report, now_s: float) -> None:
         """In virtual time, nodes know how long they may drain; here, whether they get on."""
@@ -507,7 +561,7 @@ class Supervisor:
             if self._stops_hooks_first:
                 self._stops_hooks_first = False
                 self._channels.send(control.StopHooks())
-                self._probing.drain(self._processes.killed, now_s)
+                self._probing.drain(self._killed, now_s)
                 return
         elif now_s >= self._deadline_s:
             why = "; ".join(self._probing.what_is_left(now_s)) or "packets keep coming"
@@ -544,7 +598,7 @@ class Supervisor:
             return
         self._log("WARN", f"{name} again: killing what is left")
         self.outcome.end_by_force(EXIT_CODES[number], name)
-        self._kill([*self._processes])
+        self._kill(self._processes)
         self._wait_for_killed()
 
     def _stop_with(self, exit_code: int, reason: str) -> None:
@@ -556,24 +610,26 @@ class Supervisor:
         self.phase = Phase.STOPPING
         now_s = time.monotonic()
         self.outcome.begin_to_end(now_s)
-        self._finalising.begin(now_s)
+        for node in self._nodes.values():
+            node.begin_to_end(now_s)
         self._peers.stop(self.outcome.exit_code, self.outcome.reason)
         self._channels.send(control.Stop())
         if not self._has_begun:  # no hook has run, so there is nothing to save
             for process in self._processes:
-                if self._processes.killed.issuperset(process.names):
+                if self._is_killed(process):
                     continue
+                self._mark_as_killed(process)
                 if self._peers.exist:  # nodes alone can tell peers of the end
-                    self._processes.killed.update(process.names)
                     self._kill_early_s = now_s + _CLOSING_S
                 else:
-                    self._processes.kill(process)
+                    process.kill()
         self._on_stop()
 
     def _tick_stopping(self, now_s: float) -> None:
-        for text in self._finalising.remarks(now_s):
-            self._log("INFO", text)
-        running = [p for p in self._processes if not self._processes.killed.issuperset(p.names)]
+        for node in self._nodes.values():
+            if text := node.saving(now_s):
+                self._log("INFO", text)
+        running = [process for process in self._processes if not self._is_killed(process)]
         left = [(process, self._left_s(process, now_s)) for process in running]
         self._begin_to_read([process for process, left_s in left if left_s < _READ_EARLY_S])
         overdue = [process for process, left_s in left if left_s <= 0.0]
@@ -583,16 +639,16 @@ class Supervisor:
         if len(overdue) == len(running):
             self._wait_for_killed()
             return
-        have_stopped = all(self._finalising.has_begun(process.names) for process in running)
+        have_stopped = all(any(n.has_stopped for n in self._nodes_of(p)) for p in running)
         if have_stopped and self._peers.exist and self._peers.finish(self.outcome.reports, now_s):
             self._channels.send(control.Leave())
 
     def _left_s(self, process: RunningNode, now_s: float) -> float:
         """How long a process may go on without a sign of progress."""
-        reported_s = [self.outcome.final_report_s(name) for name in process.names]
-        if all(reported_s):
-            return max(reported_s) + LEAVE_S - now_s
-        return self._finalising.left_s(process.names, now_s)
+        nodes = self._nodes_of(process)
+        if all(map(self.outcome.has_final_report, process.names)):
+            return LEAVE_S - min(node.silent_s(now_s) for node in nodes)
+        return left_s(nodes, now_s)
 
     def _why_killed(self, process: RunningNode, now_s: float) -> str:
         """A sentence about a process whose nodes have had their time."""
@@ -602,26 +658,30 @@ class Supervisor:
         if not late:
             after, why = f"{LEAVE_S:g} s after its final report", "its process did not end"
         else:
-            limit_s = self._finalising.limits_s[at_it or late[0]]
+            limit_s = self._nodes[at_it or late[0]].finalise_s
             clauses = [clause for name in late for clause in self._unfinished(name, now_s)]
             after, why = f"after {limit_s:g} s without progress", "; ".join(clauses)
         return f"{who} had to be killed {after}: {why}"
 
     def _finalising_in(self, process: RunningNode) -> str:
         """The node that keeps the others of its process waiting while it finalises; else empty."""
-        return self._finalising.current(process.names) if len(process.names) > 1 else ""
+        node = finalising(self._nodes_of(process)) if len(process.names) > 1 else None
+        return node.name if node else ""
+
+    def _nodes_of(self, process: RunningNode) -> list[NodeView]:
+        return [self._nodes[name] for name in process.names]
 
     def _unfinished(self, name: str, now_s: float) -> list[str]:
         """Clauses about a node that has not made its final report."""
-        hook, is_finalising = self._detector.executing(name), self._finalising.has_begun([name])
-        clauses = self._finalising.unfinished(name)
-        if hook and not is_finalising:
+        node, hook = self._nodes[name], self._detector.executing(name)
+        clauses = node.unfinished()
+        if hook and not node.has_stopped:
             clauses.insert(0, f"'{name}' was still executing '{hook}'")
         if clauses:
             return clauses
-        if is_finalising:
+        if node.has_stopped:
             return [f"'{name}' had finalised, but did not make its final report"]
-        silent_s = self._detector.silent_s(name, now_s)
+        silent_s = node.silent_s(now_s)
         silence = f" and had not reported for {silent_s:.0f} s" if silent_s >= SILENT_S else ""
         return [f"'{name}' did not begin to finalise{silence}"]
 

@@ -13,12 +13,12 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from enum import IntEnum
 from typing import cast
 
 import neuros.control as control
-from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Advance, Message
+from neuros.control import ELSEWHERE_VARIABLE, TO_NODES, Message
 from neuros.control.link import ControlLink
 from neuros.engine.engine import Engine
 from neuros.errors import ControlError, NeurosError
@@ -29,7 +29,7 @@ from neuros.node.peer_link import PeerLink
 from neuros.node.reports import declared
 from neuros.node.saving import Saving
 from neuros.ports import Changes, ControlStream, Middleware, PacketRecorder, VirtualRun
-from neuros.project.model import Connection, NodeFile
+from neuros.project.model import NodeFile
 from neuros.project.timing import VIRTUAL
 from neuros.stacks import allow_reading
 
@@ -100,7 +100,7 @@ class NodeProcess:
         self._has_begun = False  # whether hooks may have run; it stays while the process ends
         self._has_failed = False
         self._goes_on = threading.Event()  # begins or ends
-        self._asked: Advance | None = None
+        self._asked: control.Probe | None = None
         self._once_idle: list[Event] = []
         self._saving: tuple[str, Saving] | None = None  # of the node that finalises
         self._has_been_reset = False
@@ -171,11 +171,11 @@ class NodeProcess:
                     node.activate()
                 for node in nodes:
                     node.on_timer()
-            case control.Probe(number):
-                self._answer_probe(number)
-            case control.Advance():
+            case control.Probe(once_idle=False):
+                self._answer(message)
+            case control.Probe():
                 self._asked = message
-                self._when_idle(self._answer_at_rest)
+                self._when_idle(self._answer_asked)
             case control.Reset():
                 if why_not := self._why_not_reset():
                     self._tell(control.WasReset(why_not))
@@ -240,8 +240,8 @@ class NodeProcess:
         node.reports.write_logs()
         self._tell(node.reports.report(is_final=True))
 
-    def _answer_probe(self, number: int) -> None:
-        """Report the state of all nodes at one moment."""
+    def _answer(self, asked: control.Probe) -> None:
+        """Tell where all nodes stand at one moment."""
         assert self._middleware is not None
         is_idle = not self._middleware.loop.has_waiting_events
         # A thread besides those of NeuROS that does not wait for a connection may wake a node.
@@ -251,10 +251,11 @@ class NodeProcess:
             thread not in bound and not isinstance(thread, ControlThread)
             for thread in threading.enumerate()
         )
-        for node in self._nodes.values():
-            self._tell(
-                node.reports.probe(number, is_idle=is_idle, has_free_threads=has_free_threads)
-            )
+        probes = {
+            name: node.reports.probe(is_idle=is_idle, has_free_threads=has_free_threads)
+            for name, node in self._nodes.items()
+        }
+        self._tell(control.Probed(asked.number, probes))
 
     def _when_idle(self, action: Event) -> None:
         """Do something once no event waits: a hook that may start has a loop-back waiting."""
@@ -272,11 +273,20 @@ class NodeProcess:
         for action in actions:
             action()
 
-    def _answer_at_rest(self) -> None:
-        """Answer the last ``advance``, unless the run was resumed meanwhile."""
+    def _answer_asked(self) -> None:
+        """Answer the last probe of a step, unless the run was resumed meanwhile."""
         asked, self._asked = self._asked, None
-        if asked is not None and not self.is_ending:
-            self._tell(_at_rest(self._nodes, asked))
+        if asked is None or self.is_ending:
+            return
+        packets = {
+            name: (history.count, history.since(asked.known[name]))
+            for node in self._nodes.values()
+            for output, history in node.histories.by_output.items()
+            if (name := f"{node.name}.{output}") in asked.known
+            and history.count > asked.known[name]
+        }
+        probes = {n: node.reports.probe_at_rest(self._nodes) for n, node in self._nodes.items()}
+        self._tell(control.Probed(asked.number, probes, packets))
 
     def _reset(self, asked: control.Reset) -> None:
         """Bring all nodes back to their start, if they can still be."""
@@ -531,33 +541,3 @@ def signals_as_socket() -> Iterator[tuple[socket.socket, socket.socket]]:
         signal.set_wakeup_fd(previous)
         reader.close()
         writer.close()
-
-
-def _at_rest(nodes: Mapping[str, NodeRuntime], asked: Advance) -> control.AtRest:
-    """Times, counters and new packets of all nodes of a process at one moment."""
-    packets = {
-        name: (history.count, history.since(asked.known[name]))
-        for node in nodes.values()
-        for output, history in node.histories.by_output.items()
-        if (name := f"{node.name}.{output}") in asked.known and history.count > asked.known[name]
-    }
-    engines = [node.engine for node in nodes.values() if node.engine is not None]
-    return control.AtRest(
-        asked.number,
-        {name: time_s for name, node in nodes.items() if (time_s := node.sim_time) is not None},
-        packets,
-        nodes=tuple(nodes),
-        is_active=len(engines) == len(nodes) and all(e.is_active for e in engines),
-        sent={
-            str(w.connection): (w.sent, w.acknowledged if w.is_reliable else -1)
-            for engine in engines
-            for w in engine.send_windows.values()
-            if w.connection.destination_node not in nodes
-        },
-        received={
-            s.name: (s.received, s.acknowledged if s.is_acknowledged else -1)
-            for engine in engines
-            for s in engine.subscriptions.values()
-            if isinstance(s.key, Connection) and s.key.source_node not in nodes
-        },
-    )

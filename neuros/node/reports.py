@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from neuros.control import HookDeclaration, Hooks, LiveCounters, Metrics, NodeStatus, Probed, Report
+from neuros.control import (
+    HookDeclaration,
+    Hooks,
+    LiveCounters,
+    Metrics,
+    NodeProbe,
+    NodeStatus,
+    Report,
+)
 from neuros.engine.engine import Engine
+from neuros.engine.metrics import State
 from neuros.engine.snapshot import explain, snapshot, steadily
 from neuros.hooks import HookKind, HookSpec
 from neuros.node.instruments import NodeRecorder
@@ -139,21 +148,54 @@ class NodeReports:
             self._keeps(),
         )
 
-    def probe(self, number: int, *, is_idle: bool, has_free_threads: bool) -> Probed:
-        """A report between two events, with what can be known only then. Loop thread only.
+    def probe(self, *, is_idle: bool, has_free_threads: bool) -> NodeProbe:
+        """Where the node stands between two events. Loop thread only.
 
         A thread of a plugin may submit packets, or end the project, at any time.
         """
         engine = self._engine
         assert engine is not None
-        return Probed(
-            **self._state(),
-            number=number,
-            is_startable=engine.has_startable_packet,
-            is_wakeable=has_free_threads
+        rest = engine.rest()
+        is_wakeable = (
+            has_free_threads
             or engine.is_wakeable
-            or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file)),
+            or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file))
+        )
+        at_rest = self.probe_at_rest(())
+        return NodeProbe(
+            sent=at_rest.sent,
+            received=at_rest.received,
+            sim_time=at_rest.sim_time,
+            is_active=at_rest.is_active,
+            unread=frozenset(s.name for s in engine.subscriptions.values() if s.unread),
+            executions=sum(hook.executions for hook in engine.all_hooks),
+            lacks=rest.cause if rest.state is State.WAITING else "",
+            is_startable=engine.has_startable_packet,
+            is_wakeable=is_wakeable,
             is_idle=is_idle,
+            is_virtual=self._file.time == VIRTUAL,
+        )
+
+    def probe_at_rest(self, here: Container[str]) -> NodeProbe:
+        """Where the node stands at the end of a step, when no event waits. Loop thread only.
+
+        Connections with the nodes ``here`` are left out: nothing is under way on them then.
+        """
+        engine = self._engine
+        assert engine is not None
+        return NodeProbe(
+            sent={
+                str(window.connection): (window.sent, window.acknowledged)
+                for window in engine.send_windows.values()
+                if window.connection.destination_node not in here
+            },
+            received={
+                each.name: (each.received, each.acknowledged)
+                for each in engine.subscriptions.values()
+                if isinstance(each.key, Connection) and each.key.source_node not in here
+            },
+            sim_time=self._time.now_s,
+            is_active=engine.is_active,
         )
 
 

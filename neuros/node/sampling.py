@@ -3,13 +3,11 @@
 Each observer asks again and again (:meth:`Sampler.ask`): each time it gets what was sampled for it
 since, and a few packets more are looked at, on the thread that sends them, when they pass anyway.
 Without a question it costs nothing; with one, a node looks at so many packets at most, however
-fast it sends.
+fast it sends. What is copied while a packet passes is bounded; it is encoded by the thread that
+answers.
 
-Fields are named by their paths: ``pose.position.x``, ``ranges[3]``. Pictures of images are small,
-and made without any library: every k-th pixel of every k-th row.
-
-Spikes and arrays are gathered between two questions. What is copied while a packet passes is
-bounded; it is encoded by the thread that answers.
+Fields are named by their paths: ``pose.position.x``, ``ranges[3]``. Pictures of images are small:
+every k-th pixel of every k-th row, without any library.
 """
 
 from __future__ import annotations
@@ -19,80 +17,197 @@ import math
 import re
 import time
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from neuros.control import WORLD
 from neuros.node.instruments import Observe, Passage
 from neuros.ports import Way, WorldLook
 from neuros.time import to_seconds
 
+FieldPath: TypeAlias = "tuple[str | int, ...]"
+
 MOST_VALUES = 20
 """Packets per question of which chosen fields are read."""
+MOST_SPIKES = 20_000
+"""Spikes per question; further ones are counted only."""
+MOST_PACKETS = 4000
+"""Packets per question of which spikes are gathered."""
+MOST_ARRAYS = 20
+"""Packets per question of which an array is read."""
+LONGEST_ARRAY = 4096
+MOST_FIELDS = 300
+MOST_ELEMENTS = 12
+WIDTH, HEIGHT = 320, 240
+"""A picture is no larger than this."""
+
+_LONGEST_TEXT = 200
+_MOST_COMPRESSED_BYTES = 400_000
+_STEP = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)\]")
+# Bytes per pixel, by the names of sensor_msgs/image_encodings.
+PIXEL_BYTES = {"mono8": 1, "8UC1": 1, "mono16": 2, "16UC1": 2, "rgb8": 3, "bgr8": 3, "8UC3": 3}
+PIXEL_BYTES |= {"rgba8": 4, "bgra8": 4, "32FC1": 4}
+
+
+class _Part(Protocol):
+    """What is read of the packets of a port.
+
+    Attributes:
+        is_full: whether no further packet is read, so that a page that nobody reads costs nothing.
+    """
+
+    @property
+    def is_full(self) -> bool: ...
+    def add(self, packet: Any) -> None:
+        """Read a packet, of which anything may be wrong."""
+
+    def answer(self) -> Mapping[str, Any]:
+        """What was read, ready for JSON; empty if no packet has passed."""
+
+
+class _Fields:
+    """Chosen numbers of each packet, behind the time when it passed (monotonic, seconds)."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = list(names)
+        self._paths = [*map(parse_path, names)]
+        self._values: list[list[float | None]] = []
+
+    @property
+    def is_full(self) -> bool:
+        return len(self._values) >= MOST_VALUES
+
+    def add(self, packet: Any) -> None:
+        values = [number_at(packet, path) for path in self._paths]
+        self._values.append([time.monotonic(), *values])
+
+    def answer(self) -> Mapping[str, Any]:
+        return {"fields": self._names, "values": self._values} if self._values else {}
+
+
+class _One:
+    """One packet: ``read`` copies what is needed of it, and ``encode`` makes it ready for JSON."""
+
+    def __init__(
+        self, name: str, read: Callable[[Any], Any], encode: Callable[[Any], dict[str, Any]] = dict
+    ) -> None:
+        self._name = name
+        self._read = read
+        self._encode = encode
+        self._found: Any = None
+        self.is_full = False
+
+    def add(self, packet: Any) -> None:
+        self.is_full = True
+        self._found = self._read(packet)
+
+    def answer(self) -> Mapping[str, Any]:
+        return {} if self._found is None else {self._name: self._encode(self._found)}
+
+
+class _Spikes:
+    """Spikes of packets of type ``neuros_msgs/msg/Spikes``.
+
+    ``senders`` (uint32) and ``times`` (float64, seconds) are base64 of little-endian numbers;
+    ``count`` is that of all spikes that passed, ``size`` that of the neurons, ``stamp_s`` the stamp
+    of the last packet, in seconds.
+    """
+
+    def __init__(self) -> None:
+        self._senders, self._times = array("I"), array("d")
+        self._size = self._count = self._packets = 0
+        self._stamp_s = 0.0
+
+    @property
+    def is_full(self) -> bool:
+        return self._packets >= MOST_PACKETS or self._count > 2 * MOST_SPIKES
+
+    def add(self, packet: Any) -> None:
+        senders, times = packet.senders, packet.times
+        self._packets += 1
+        if len(senders) != len(times):
+            raise ValueError(f"{len(senders)} senders do not fit {len(times)} times")
+        self._count += len(senders)
+        self._size = max(self._size, packet.size)
+        self._stamp_s = to_seconds(packet)
+        room = max(0, MOST_SPIKES - len(self._times))
+        self._times.extend(array("d", times[:room]))
+        self._senders.extend(array("I", senders[:room]))
+
+    def answer(self) -> Mapping[str, Any]:
+        if not self._packets:
+            return {}
+        known = min(len(self._times), len(self._senders))  # the other thread may be adding
+        found = {"size": self._size, "count": self._count, "stamp_s": self._stamp_s}
+        senders, times = _base64(self._senders[:known]), _base64(self._times[:known])
+        return {"spikes": {**found, "senders": senders, "times": times}}
+
+
+class _Arrays:
+    """An array of each of a few packets.
+
+    Of each packet: when it passed (monotonic, seconds), its numbers, base64 of float32, at most
+    :data:`LONGEST_ARRAY`, and how many it has.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._path = parse_path(name)
+        self._packets = 0
+        self._rows: list[tuple[float, array[float], int]] = []
+
+    @property
+    def is_full(self) -> bool:
+        return self._packets >= MOST_ARRAYS
+
+    def add(self, packet: Any) -> None:
+        self._packets += 1
+        numbers = _follow(packet, self._path)
+        self._rows.append((time.monotonic(), array("f", numbers[:LONGEST_ARRAY]), len(numbers)))
+
+    def answer(self) -> Mapping[str, Any]:
+        rows = [[time_s, _base64(row), length] for time_s, row, length in self._rows]
+        return {"arrays": {self._name: rows}} if rows else {}
 
 
 class _Request:
     """A request for packets of one port, and its answer so far."""
 
     def __init__(self, wanted: Mapping[str, Any]) -> None:
-        self._names: list[str] = list(wanted.get("fields", ()))
-        self._paths: list[FieldPath] = [parse_path(name) for name in self._names]
-        self._wants_all = bool(wanted.get("all"))
-        self._wants_image = bool(wanted.get("image"))
-        self._most = int(wanted.get("most_elements", 0))
-        self._spikes = SpikeBatch() if wanted.get("spikes") else None
-        arrays: Sequence[str] = wanted.get("arrays", ())
-        self._arrays = {name: ArrayBatch(parse_path(name)) for name in arrays}
-        self._values: list[list[float | None]] = []
-        self._all: dict[str, Any] | None = None
-        self._image: Preview | None = None
+        most = int(wanted.get("most_elements", 0))
+        self._parts: list[_Part] = [*map(_Arrays, wanted.get("arrays", ()))]
+        if wanted.get("fields"):
+            self._parts.append(_Fields(wanted["fields"]))
+        if wanted.get("spikes"):
+            self._parts.append(_Spikes())
+        if wanted.get("all"):
+            self._parts.append(_One("all", lambda packet: all_fields(packet, most)))
+        if wanted.get("image"):
+            self._parts.append(_One("image", preview, Preview.encode))
         self._fault: str | None = None
 
     @property
     def is_met(self) -> bool:
         """Whether no further packet is wanted."""
-        has_values = not self._paths or len(self._values) >= MOST_VALUES
-        batches = (*self._arrays.values(), *([self._spikes] if self._spikes else ()))
-        is_gathered = all(batch.is_full for batch in batches)
-        return has_values and is_gathered and not self._wants_all and not self._wants_image
+        return all(part.is_full for part in self._parts)
 
     def sample(self, packet: Any) -> None:
         """Sample a packet; what cannot be read of it is no fault of the node's."""
-        try:
-            if self._paths and len(self._values) < MOST_VALUES:
-                values = [number_at(packet, path) for path in self._paths]
-                self._values.append([time.monotonic(), *values])
-            if self._spikes is not None and not self._spikes.is_full:
-                self._spikes.add(packet)
-            for batch in self._arrays.values():
-                if not batch.is_full:
-                    batch.add(packet)
-            if self._wants_all:
-                self._wants_all = False
-                self._all = all_fields(packet, self._most)
-            if self._wants_image:
-                self._wants_image = False
-                self._image = preview(packet)
-        except Exception as error:  # a plugin may have put anything in there
-            self._fault = f"{type(error).__name__}: {error}"
+        for part in self._parts:
+            if not part.is_full:
+                try:
+                    part.add(packet)
+                except Exception as error:  # a plugin may have put anything in there
+                    self._fault = f"{type(error).__name__}: {error}"
 
     def answer(self) -> dict[str, Any]:
         """The answer, ready for JSON; empty if no packet has passed."""
         found: dict[str, Any] = {}
-        if self._values:
-            found |= {"fields": self._names, "values": self._values}
-        if self._spikes is not None and (spikes := self._spikes.encode()):
-            found["spikes"] = spikes
-        if arrays := {name: rows for name, b in self._arrays.items() if (rows := b.encode())}:
-            found["arrays"] = arrays
-        if self._all is not None:
-            found["all"] = self._all
-        if self._image is not None:
-            found["image"] = self._image.encode()
-        if self._fault is not None:
-            found["fault"] = self._fault
-        return found
+        for part in self._parts:
+            for key, value in part.answer().items():
+                found[key] = {**found[key], **value} if key == "arrays" and key in found else value
+        return found if self._fault is None else {**found, "fault": self._fault}
 
 
 class _ArrayMessage:
@@ -154,9 +269,8 @@ class Sampler:
         Of each port: ``fields``, paths like ``pose.position.x`` or ``data[3]``, read of up to
         :data:`MOST_VALUES` packets; ``all``, every field of one packet (of arrays the first
         ``most_elements``); ``image``, a small picture of one packet; ``spikes``, the spikes
-        of all packets; ``arrays``, paths of arrays, read of a few packets (see
-        :class:`ArrayBatch`). ``#world`` stands for the simulated world of the node, which
-        is shown at once.
+        of all packets; ``arrays``, paths of arrays, read of a few packets. ``#world``
+        stands for the simulated world of the node, which is shown at once.
         """
         asked = self._asked.get(asker, {})
         answers = {port: answer for port, request in asked.items() if (answer := request.answer())}
@@ -179,14 +293,6 @@ class Sampler:
         return answers
 
 
-FieldPath: TypeAlias = "tuple[str | int, ...]"
-
-MOST_FIELDS = 300
-MOST_ELEMENTS = 12
-_LONGEST_TEXT = 200
-_STEP = re.compile(r"\.?([A-Za-z_]\w*)|\[(\d+)\]")
-
-
 def parse_path(text: str) -> FieldPath:
     """The steps of a path, names of fields and places in sequences."""
     return tuple(
@@ -194,12 +300,17 @@ def parse_path(text: str) -> FieldPath:
     )
 
 
+def _follow(packet: Any, path: FieldPath) -> Any:
+    """What a path leads to. Raises ``AttributeError`` or ``LookupError`` if there is nothing."""
+    for step in path:
+        packet = packet[step] if isinstance(step, int) else getattr(packet, step)
+    return packet
+
+
 def number_at(packet: Any, path: FieldPath) -> float | None:
     """The number there; ``None`` if there is nothing, or no (finite) number."""
     try:
-        for step in path:
-            packet = packet[step] if isinstance(step, int) else getattr(packet, step)
-        number = float(packet)
+        number = float(_follow(packet, path))
     except (AttributeError, LookupError, TypeError, ValueError):
         return None
     return number if math.isfinite(number) else None
@@ -243,26 +354,6 @@ def _elements(values: Sequence[Any], path: str, most: int) -> Iterator[tuple[str
         yield from _walk(each, f"{path}[{place}]", most)
 
 
-WIDTH, HEIGHT = 320, 240
-"""A picture is no larger than this."""
-
-_MOST_COMPRESSED_BYTES = 400_000
-
-# Bytes per pixel, by the names of sensor_msgs/image_encodings.
-PIXEL_BYTES = {
-    "rgb8": 3,
-    "bgr8": 3,
-    "rgba8": 4,
-    "bgra8": 4,
-    "mono8": 1,
-    "8UC1": 1,
-    "8UC3": 3,
-    "mono16": 2,
-    "16UC1": 2,
-    "32FC1": 4,
-}
-
-
 @dataclass(frozen=True)
 class Preview:
     """A picture in the making: what was copied while the packet passed.
@@ -301,7 +392,7 @@ class Preview:
             "height": height,
             "of": [self.width, self.height],
             "encoding": self.encoding,
-            "data": base64.b64encode(data).decode(),
+            "data": _base64(data),
         }
 
 
@@ -332,100 +423,5 @@ def preview(packet: Any) -> Preview:
     return Preview(packet.encoding, width, height, rows, stride, size)
 
 
-MOST_SPIKES = 20_000
-"""Spikes per question; further ones are counted only."""
-MOST_PACKETS = 4000
-"""Packets per question of which spikes are gathered."""
-MOST_ARRAYS = 20
-"""Packets per question of which an array is read."""
-LONGEST_ARRAY = 4096
-
-
-class SpikeBatch:
-    """Spikes of packets of type ``neuros_msgs/msg/Spikes``."""
-
-    def __init__(self) -> None:
-        self._senders, self._times = array("I"), array("d")
-        self._size = self._count = self._packets = 0
-        self._stamp_s = 0.0
-
-    @property
-    def is_full(self) -> bool:
-        """Whether no further packet is read, so that a page that nobody reads costs nothing."""
-        return self._packets >= MOST_PACKETS or self._count > 2 * MOST_SPIKES
-
-    def add(self, packet: Any) -> None:
-        """Add the spikes of a packet.
-
-        Raises:
-            ValueError: if senders and times are not of one length.
-        """
-        senders, times = packet.senders, packet.times
-        self._packets += 1
-        if len(senders) != len(times):
-            raise ValueError(f"{len(senders)} senders do not fit {len(times)} times")
-        self._count += len(senders)
-        self._size = max(self._size, packet.size)
-        self._stamp_s = to_seconds(packet)
-        room = max(0, MOST_SPIKES - len(self._times))
-        self._times.extend(array("d", times[:room]))
-        self._senders.extend(array("I", senders[:room]))
-
-    def encode(self) -> dict[str, Any] | None:
-        """The spikes, ready for JSON; ``None`` if no packet has passed.
-
-        ``senders`` (uint32) and ``times`` (float64, seconds) are base64 of little-endian numbers;
-        ``count`` is that of all spikes that passed, ``size`` that of the neurons, ``stamp_s`` the
-        stamp of the last packet, in seconds.
-        """
-        if not self._packets:
-            return None
-        known = min(len(self._times), len(self._senders))  # the other thread may be adding
-        return {
-            "size": self._size,
-            "count": self._count,
-            "stamp_s": self._stamp_s,
-            "senders": _base64(self._senders[:known]),
-            "times": _base64(self._times[:known]),
-        }
-
-
-class ArrayBatch:
-    """An array of each of a few packets.
-
-    Args:
-        steps: the path of the array in the packet.
-    """
-
-    def __init__(self, steps: Sequence[str | int]) -> None:
-        self._steps = steps
-        self._packets = 0
-        self._rows: list[tuple[float, array[float], int]] = []
-
-    @property
-    def is_full(self) -> bool:
-        """Whether no further packet is read."""
-        return self._packets >= MOST_ARRAYS
-
-    def add(self, packet: Any) -> None:
-        """Add the array of a packet.
-
-        Raises:
-            AttributeError, LookupError, TypeError, ValueError: if there is no array of numbers.
-        """
-        self._packets += 1
-        for step in self._steps:
-            packet = packet[step] if isinstance(step, int) else getattr(packet, step)
-        row = array("f", packet[:LONGEST_ARRAY])
-        self._rows.append((time.monotonic(), row, len(packet)))
-
-    def encode(self) -> list[list[Any]]:
-        """Of each packet: when it passed (monotonic, seconds), its numbers, and how many it has.
-
-        The numbers are base64 of float32, at most :data:`LONGEST_ARRAY`.
-        """
-        return [[time_s, _base64(row), length] for time_s, row, length in self._rows]
-
-
-def _base64(numbers: array[Any]) -> str:
-    return base64.b64encode(numbers.tobytes()).decode()
+def _base64(content: bytes | array[Any]) -> str:
+    return base64.b64encode(content).decode()

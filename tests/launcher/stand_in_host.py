@@ -117,13 +117,14 @@ class Host:
 
     def answer(self, message: dict[str, Any]) -> None:
         if message["kind"] == "probe":
-            self.report(
-                "probed",
-                number=message["number"],
-                is_startable=False,
-                is_wakeable=not self.is_idle,
-                is_idle=self.is_idle,
-            )
+            outgoing, incoming = self.connections["outgoing"], self.connections["incoming"]
+            probe = {
+                "sent": {k: (c["sent"], c["acknowledged"]) for k, c in outgoing.items()},
+                "received": {k: (c["received"], c["acknowledged"]) for k, c in incoming.items()},
+                "is_wakeable": not self.is_idle,
+                "is_idle": self.is_idle,
+            }
+            self.send("probed", number=message["number"], nodes=dict.fromkeys(NAMES, probe))
 
     def serve(self) -> None:
         """Do as asked, to a proper end."""

@@ -55,10 +55,3 @@ def test_what_a_reset_takes_back_has_passed() -> None:
     assert outcome(4.0, points).real_time_factor == pytest.approx(1.0)
     points = [(0.0, 10.0), (3.0, 11.0), (0.0, 13.0)]  # reset while the plot initialised
     assert outcome(10.0, points).real_time_factor == pytest.approx(1.0)
-
-
-def test_the_time_in_which_the_launcher_stood_still_makes_no_report_older() -> None:
-    ended = Outcome()
-    ended.add(Report(node="robot", is_final=True), 3.0)
-    ended.shift(10.0)
-    assert ended.final_report_s("robot") == 13.0

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from neuros.control import Report
+from neuros.control import NodeProbe, Report
 from neuros.launcher.peers import (
     DRAINED,
     DRAINING,
@@ -57,9 +57,15 @@ def launcher() -> Launcher:
     return Launcher()
 
 
-def sent(number: int, acknowledged: int | None = None) -> dict[str, Report]:
-    """A report of ``a``."""
-    counters = {"sent": number, "acknowledged": number if acknowledged is None else acknowledged}
+def sent(number: int, acknowledged: int | None = None) -> dict[str, NodeProbe]:
+    """Where ``a`` stands."""
+    counts = number, number if acknowledged is None else acknowledged
+    return {"a": NodeProbe(sent={str(HERE_TO_THERE): counts})}
+
+
+def reported(number: int) -> dict[str, Report]:
+    """The last report of ``a``."""
+    counters = {"sent": number, "acknowledged": number}
     metrics: Any = {"outgoing": {str(HERE_TO_THERE): counters}, "incoming": {}}
     return {"a": Report(node="a", metrics=metrics)}
 
@@ -214,9 +220,9 @@ def test_it_is_drained_when_both_launchers_are_and_nothing_is_between(launcher: 
     assert not launcher.peers.agree_on_end(sent(3)), "the peer has not heard of it yet"
     assert said_last(launcher).phase == DRAINED
     drained = replace(ELSEWHERE, phase=DRAINED)
-    launcher.hears("b", replace(drained, number=2, counters=received(2)))
+    launcher.hears("b", replace(drained, number=2, received={str(HERE_TO_THERE): (2, 2)}))
     assert not launcher.peers.agree_on_end(sent(3)), "a packet is under way"
-    launcher.hears("b", replace(drained, number=3, counters=received(3)))
+    launcher.hears("b", replace(drained, number=3, received={str(HERE_TO_THERE): (3, 3)}))
     assert not launcher.peers.agree_on_end(sent(3, acknowledged=2)), "an acknowledgement is"
     assert launcher.peers.agree_on_end(sent(3))
 
@@ -243,25 +249,26 @@ def test_a_peer_that_has_stopped_is_not_asked(launcher: Launcher) -> None:
 
 def test_each_launcher_waits_for_the_final_counters_of_its_peer(launcher: Launcher) -> None:
     launcher.hears("b", ELSEWHERE)
-    assert not launcher.peers.finish(sent(3), 10.0)
+    assert not launcher.peers.finish(reported(3), 10.0)
     assert said_last(launcher).phase == OVER
     assert said_last(launcher).counters["a"]["outgoing"][str(HERE_TO_THERE)]["sent"] == 3
     assert launcher.peers.counters() == {}
     launcher.hears("b", replace(ELSEWHERE, number=2, phase=OVER, counters=received(3)))
-    assert launcher.peers.finish(sent(3), 10.1)
+    assert launcher.peers.finish(reported(3), 10.1)
     assert launcher.peers.counters() == received(3)
 
 
 def test_but_not_for_long_and_not_for_one_that_is_gone(launcher: Launcher) -> None:
     launcher.hears("b", ELSEWHERE)
-    assert not launcher.peers.finish(sent(3), 10.0)
-    assert launcher.peers.finish(sent(3), 10.0 + WAITS_S)
+    assert not launcher.peers.finish(reported(3), 10.0)
+    assert launcher.peers.finish(reported(3), 10.0 + WAITS_S)
     launcher.hears("b", None, 10.0)
-    assert launcher.peers.finish(sent(3), 10.0)
+    assert launcher.peers.finish(reported(3), 10.0)
 
 
 def test_a_state_comes_through_as_it_was() -> None:
-    state = PeerState("r", "h", 4, Stage.LOADED, RUNNING, 0, "é", "o", 1.5, received(3))
+    ends = {"a.o -> b.x": (3, 2)}
+    state = PeerState("r", "h", 4, Stage.LOADED, RUNNING, 0, "é", "o", 1.5, received(3), ends, ends)
     assert state_from(state.to_text()) == state
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from msgspec import structs
 
 from neuros.control import Report
+from neuros.launcher.nodes import NodeView
 from neuros.launcher.stall_detector import Backlog, StallDetector
 from neuros.launcher.thread_reader import ThreadReader
 from neuros.ports import RunningNode
@@ -67,17 +68,30 @@ def reader_of(*reads: ProcessThreads) -> ThreadReader:
     return AtOnce(lambda _: cast(RunningNode, process))
 
 
-def detector_of(*names: str) -> StallDetector:
-    """A detector from second 0 on, whose nodes have all been loaded."""
-    detector = StallDetector(names, 0.0, reader_of(ProcessThreads()))
+class Detector(StallDetector):
+    """A detector from second 0 on, with a record of each node."""
+
+    def __init__(self, names: Iterable[str], reader: ThreadReader | None = None) -> None:
+        self.nodes = {name: NodeView(name) for name in names}
+        super().__init__(self.nodes, 0.0, reader or reader_of(ProcessThreads()))
+
+    def greet(self, names: Sequence[str], plugins: dict[str, str], now_s: float) -> None:
+        """The process of these nodes connects."""
+        for name in names:
+            self.nodes[name].connect(names, plugins, now_s)
+
+
+def detector_of(*names: str) -> Detector:
+    """One whose nodes have all been loaded, in one process."""
+    detector = Detector(names)
     detector.greet(names, {}, 0.0)
     for name in names:
         detector.report(report(name), 0.0)
-        detector.ready.add(name)
+        detector.nodes[name].is_ready = True
     return detector
 
 
-def remarks(detector: StallDetector, now_s: float) -> list[str]:
+def remarks(detector: Detector, now_s: float) -> list[str]:
     return [
         text
         for said in (
@@ -131,6 +145,7 @@ def test_a_packet_that_arrives_is_a_movement() -> None:
 def test_while_the_launcher_itself_stood_still_nobody_rested_or_was_silent() -> None:
     detector = detector_of("a")
     detector.shift(10.0)
+    detector.nodes["a"].shift(10.0)
     assert not detector.has_just_stalled(14.9)
     assert remarks(detector, 14.9) == []
     assert detector.has_just_stalled(15.0)
@@ -173,7 +188,7 @@ def test_nothing_rests_while_a_hook_executes() -> None:
 
 
 def test_there_is_no_standstill_before_all_nodes_are_loaded_and_registered() -> None:
-    detector = StallDetector(["a", "b"], 0.0, reader_of(ProcessThreads()))
+    detector = Detector(["a", "b"])
     detector.greet(["a"], {}, 0.0)
     detector.report(report("a"), 0.0)
     assert not detector.has_just_stalled(9.0), "b has not come yet"
@@ -220,22 +235,22 @@ def test_a_connection_that_both_ends_wait_for_is_named_once() -> None:
 
 
 def test_nodes_that_start_slowly_are_named() -> None:
-    detector = StallDetector(["a", "b", "c"], 0.0, reader_of(ProcessThreads()))
+    detector = Detector(["a", "b", "c"])
     detector.greet(["b", "c"], {}, 0.0)
     detector.report(LOADING, 4.0)
-    detector.loaded.add("c")  # and waits for the others in its process
+    detector.nodes["c"].is_loaded = True  # and waits for the others in its process
     detector.report(structs.replace(LOADING, node="c"), 4.0)
     assert remarks(detector, 5.0) == ["still starting: a", "still importing their plugins: b"]
 
 
 def test_nodes_that_keep_the_others_waiting_are_named() -> None:
-    slow = StallDetector(["a", "b"], 0.0, reader_of(ProcessThreads()))
+    slow = Detector(["a", "b"])
     slow.greet(["a", "b"], {}, 0.0)
-    slow.ready.add("a")
+    slow.nodes["a"].is_ready = True
     for name in ("a", "b"):
         slow.report(report(name), 4.0)
     assert remarks(slow, 5.0) == ["still initialising: b"]
-    slow.ready.add("b")
+    slow.nodes["b"].is_ready = True
     for name in ("a", "b"):
         slow.report(report(name), 14.0)
     assert remarks(slow, 15.0) == []
@@ -280,9 +295,9 @@ STACK = '  File "/a.py", line 3, in step\n  File "/lib/solver.py", line 9, in so
 AT_WORK = 'worker holds Python\'s global lock:\n  File "/a.py", line 20, in work'
 
 
-def of_plugins(reader: ThreadReader, *processes: dict[str, str]) -> StallDetector:
+def of_plugins(reader: ThreadReader, *processes: dict[str, str]) -> Detector:
     """A detector of processes that have nodes with these plugins, and have reported at second 0."""
-    detector = StallDetector([name for plugins in processes for name in plugins], 0.0, reader)
+    detector = Detector([name for plugins in processes for name in plugins], reader)
     for plugins in processes:
         detector.greet([*plugins], plugins, 0.0)
         for name in plugins:
@@ -290,7 +305,7 @@ def of_plugins(reader: ThreadReader, *processes: dict[str, str]) -> StallDetecto
     return detector
 
 
-def silence(detector: StallDetector, now_s: float = 5.0) -> list[str]:
+def silence(detector: Detector, now_s: float = 5.0) -> list[str]:
     """What is said of nodes that do not report."""
     return [text for _, text in detector.remarks_on_silence(now_s)]
 
@@ -350,7 +365,7 @@ def test_a_plugin_whose_import_keeps_the_lock_is_named() -> None:
     frames = (("/lib/importlib.py", 1, "exec_module"), ("/a.py", 1, "<module>"))
     held = Thread("MainThread", is_main=True, has_lock=True, frames=frames)
     reader = reader_of(ProcessThreads((held,)))
-    detector = StallDetector(["a"], 0.0, reader)
+    detector = Detector(["a"], reader)
     detector.greet(["a"], {"a": "/a.py"}, 1.0)
     ((severity, text),) = detector.remarks_on_silence(6.0)
     line, _, stack = text.partition("\n")
@@ -365,7 +380,7 @@ def test_a_plugin_whose_import_keeps_the_lock_is_named() -> None:
 def test_so_is_one_that_has_not_come_to_its_plugin_yet() -> None:
     frames = (("/lib/importlib.py", 1, "exec_module"), ("/lib/rclpy.py", 1, "<module>"))
     held = Thread("MainThread", is_main=True, has_lock=True, frames=frames)
-    detector = StallDetector(["a", "b"], 0.0, reader_of(ProcessThreads((held,))))
+    detector = Detector(["a", "b"], reader_of(ProcessThreads((held,))))
     detector.greet(["a", "b"], {"a": "/a.py", "b": "/b.py"}, 1.0)
     (text,) = silence(detector, 6.0)
     assert text.startswith("a, b have been importing their plugins for 5 s, and cannot report")
@@ -389,8 +404,7 @@ def test_of_nodes_of_one_plugin_in_one_process_the_one_is_named_that_executed_la
 
 
 def test_a_process_tells_only_of_plugins_of_its_own() -> None:
-    reader = reader_of(HELD)
-    detector = of_plugins(reader, {"a": "/a.py"})
+    detector = of_plugins(reader_of(HELD), {"a": "/a.py"}, {"b": "/b.py"})
     detector.greet(["b"], {"b": "/b.py", "a": "/elsewhere.py"}, 0.0)
     (text,) = silence(detector)[:1]
     assert text.startswith("a has been executing 'step'")
@@ -481,7 +495,7 @@ def test_packets_that_are_not_taken_in_are_said_too() -> None:
 
 
 def test_a_node_that_can_take_in_nothing_has_not_fallen_behind() -> None:
-    detector = StallDetector(["camera", "brain"], 0.0, reader_of(ProcessThreads()))
+    detector = Detector(["camera", "brain"])
     detector.greet(["camera", "brain"], {}, 0.0)
     backlog = Backlog([CONNECTION], detector.is_held_up)
     for second in range(7):

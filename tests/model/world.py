@@ -16,10 +16,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from neuros.control import Message, Probe, Probed
+from neuros.control import Message, NodeProbe, Probe, Probed
 from neuros.engine.engine import Engine
 from neuros.engine.hook import Hook
-from neuros.engine.snapshot import snapshot
 from neuros.hooks import HookKind, HookSpec
 from neuros.launcher.quiescence import Probing, Verdict
 from neuros.project.model import Connection, Port
@@ -364,7 +363,7 @@ class World:
 
     def take_answer(self, answer: Probed) -> None:
         """A node has answered a probe."""
-        self.probing.add(answer)
+        self.probing.add(answer, self.now_s)
         if self.probing.verdict is Verdict.DRAINED and not self.is_drained:
             self._end_drained()
 
@@ -419,19 +418,11 @@ class _Question:
 
 def _answer_of(node: ModelNode, number: int) -> Probed:
     """What a node answers to a probe, without the figures that only people read."""
-    metrics = snapshot(node.engine, 0)
-    counts: Any = {
-        side: {
-            name: {key: row[key] for key in ("sent", "received", "acknowledged") if key in row}
-            for name, row in metrics[side].items()
-        }
-        for side in ("outgoing", "incoming")
-    }
-    return Probed(
-        node=node.name,
-        metrics=counts,
-        number=number,
-        is_startable=node.engine.has_startable_packet,
-        is_wakeable=False,
-        is_idle=True,
+    engine = node.engine
+    windows, subscriptions = engine.send_windows.values(), engine.subscriptions.values()
+    probe = NodeProbe(
+        sent={str(each.connection): (each.sent, each.acknowledged) for each in windows},
+        received={each.name: (each.received, each.acknowledged) for each in subscriptions},
+        is_startable=engine.has_startable_packet,
     )
+    return Probed(number, {node.name: probe})
