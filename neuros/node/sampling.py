@@ -19,7 +19,7 @@ import math
 import re
 import time
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -29,7 +29,9 @@ from neuros.ports import Way, WorldLook
 from neuros.time import to_seconds
 
 MOST_VALUES = 20
-"""Packets per question of which chosen fields are read."""
+"""Packets per question of which chosen fields are read, or that are read whole."""
+MOST_BYTES = 4_000_000
+"""Of whole packets, per question and port; one packet may be larger."""
 
 
 class _Request:
@@ -44,6 +46,8 @@ class _Request:
         self._spikes = SpikeBatch() if wanted.get("spikes") else None
         arrays: Sequence[str] = wanted.get("arrays", ())
         self._arrays = {name: ArrayBatch(parse_path(name)) for name in arrays}
+        self._packets: list[tuple[float, bytes]] | None = [] if wanted.get("packets") else None
+        self._room = MOST_BYTES
         self._values: list[list[float | None]] = []
         self._all: dict[str, Any] | None = None
         self._image: Preview | None = None
@@ -55,11 +59,21 @@ class _Request:
         has_values = not self._paths or len(self._values) >= MOST_VALUES
         batches = (*self._arrays.values(), *([self._spikes] if self._spikes else ()))
         is_gathered = all(batch.is_full for batch in batches)
+        is_gathered &= not self._wants_packet
         return has_values and is_gathered and not self._wants_all and not self._wants_image
 
-    def sample(self, packet: Any) -> None:
+    @property
+    def _wants_packet(self) -> bool:
+        packets = self._packets
+        return packets is not None and len(packets) < MOST_VALUES and self._room > 0
+
+    def sample(self, packet: Any, encode: Callable[[], bytes]) -> None:
         """Sample a packet; what cannot be read of it is no fault of the node's."""
         try:
+            if self._packets is not None and self._wants_packet:
+                data = encode()
+                self._room -= len(data)
+                self._packets.append((time.monotonic(), data))
             if self._paths and len(self._values) < MOST_VALUES:
                 values = [number_at(packet, path) for path in self._paths]
                 self._values.append([time.monotonic(), *values])
@@ -86,6 +100,8 @@ class _Request:
             found["spikes"] = spikes
         if arrays := {name: rows for name, b in self._arrays.items() if (rows := b.encode())}:
             found["arrays"] = arrays
+        if self._packets:
+            found["packets"] = self._packets
         if self._all is not None:
             found["all"] = self._all
         if self._image is not None:
@@ -113,13 +129,17 @@ class _ArrayMessage:
 class Sampler:
     """Samples packets for observers.
 
+    Args:
+        encode: serialises a packet.
+
     Attributes:
         requests: by port (an output's name, or the topic of an external input), what is wanted by
             each observer; empty without requests.
         look_at_world: shows the simulated world of the node, ``None`` where it has none.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, encode: Callable[[Any], bytes]) -> None:
+        self._encode = encode
         self.requests: dict[str, list[_Request]] = {}
         self.look_at_world: WorldLook | None = None
         self._asked: dict[int, dict[str, _Request]] = {}
@@ -131,18 +151,19 @@ class Sampler:
             port = passage.port.external_topic if passage.way is Way.HEARD else passage.port.name
             name, is_array = str(port), passage.port.array is not None
 
-            def observe(packet: Any, _: bytes | None) -> None:
-                self.sample(name, _ArrayMessage(packet) if is_array else packet)
+            def observe(packet: Any, data: bytes | None) -> None:
+                shown = _ArrayMessage(packet) if is_array else packet
+                self.sample(name, shown, lambda: data or self._encode(packet))
 
             self._passages.append((name, passage, observe))
 
-    def sample(self, port: str, packet: Any) -> None:
-        """A packet passes. The thread of the hooks only."""
+    def sample(self, port: str, packet: Any, encode: Callable[[], bytes] = bytes) -> None:
+        """A packet passes; ``encode`` serialises it. The thread of the hooks only."""
         waiting = self.requests  # the next question, which may come meanwhile, brings another one
         requests = waiting.get(port)
         if requests is not None:
             for request in requests:
-                request.sample(packet)
+                request.sample(packet, encode)
             if all(request.is_met for request in requests):
                 del waiting[port]
 
@@ -155,8 +176,9 @@ class Sampler:
         :data:`MOST_VALUES` packets; ``all``, every field of one packet (of arrays the first
         ``most_elements``); ``image``, a small picture of one packet; ``spikes``, the spikes
         of all packets; ``arrays``, paths of arrays, read of a few packets (see
-        :class:`ArrayBatch`). ``#world`` stands for the simulated world of the node, which
-        is shown at once.
+        :class:`ArrayBatch`); ``packets``, whole packets as ROS serialises them, each with the time
+        at which it passed, up to :data:`MOST_VALUES` and :data:`MOST_BYTES`. ``#world`` stands
+        for the simulated world of the node, which is shown at once.
         """
         asked = self._asked.get(asker, {})
         answers = {port: answer for port, request in asked.items() if (answer := request.answer())}
