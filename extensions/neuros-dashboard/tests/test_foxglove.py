@@ -58,6 +58,7 @@ def wait_until(condition: Callable[[], Any]) -> None:
 def test_an_app_sees_a_run_and_pauses_and_steps_it_beside_a_dashboard(tmp_path: Path) -> None:
     with contextlib.ExitStack() as stack:
         taken = stack.enter_context(socket.socket())
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         with contextlib.suppress(OSError):  # somebody else has it: all the same
             taken.bind((HOST, USUAL_PORT))
             taken.listen()
