@@ -63,6 +63,7 @@ autodoc_mock_imports = [
     "pandas",
     "pytest",
     "rerun",
+    "foxglove",
     "trimesh",
 ]
 

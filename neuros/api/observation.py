@@ -6,13 +6,13 @@ import os
 import select
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuros.backends.run_processes import RUN_ID
-from neuros.control import GetStatus, NodeStatus, Watch
+from neuros.control import GetStatus, Message, NodeStatus, Watch
 from neuros.control.link import ControlLink
 
 if TYPE_CHECKING:
@@ -100,16 +100,32 @@ def statuses(
         link: to the supervisor; closed at the end.
         wanted: the samples to ask for next, by node.
     """
+    for each in answers(link, lambda: [GetStatus(wanted())], period_s):
+        if isinstance(each, NodeStatus):
+            yield each
+
+
+def answers(
+    link: ControlLink, ask: Callable[[], Iterable[Message]], period_s: float
+) -> Iterator[Message | None]:
+    """What the supervisor sends, until the run is over; ``None`` once each period.
+
+    Args:
+        link: to the supervisor; closed at the end.
+        ask: what to send to it, each period.
+    """
     with closing(link):
         link.send(Watch())
         next_s = time.monotonic()
         while True:
             if time.monotonic() >= next_s:
                 next_s = time.monotonic() + period_s
-                link.send(GetStatus(wanted()))
+                for message in ask():
+                    link.send(message)
+                yield None
             if not select.select([link], [], [], max(0.0, next_s - time.monotonic()))[0]:
                 continue
             messages = link.receive()
             if messages is None:
                 return
-            yield from (each for each in messages if isinstance(each, NodeStatus))
+            yield from messages

@@ -128,7 +128,7 @@ class NodeRuntime:
         self.time = SimulatedTime(
             *(file.node, duration_sim_s, clock, self._end_by_duration, wall_ns)
         )
-        sampler = Sampler()
+        sampler = Sampler(middleware.packets.encode)
         self.keeping = Keeping(self.name, self.run_dir, file.restored)
         self._services = PluginServices(
             middleware.packets,

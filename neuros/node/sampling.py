@@ -29,7 +29,9 @@ from neuros.time import to_seconds
 FieldPath: TypeAlias = "tuple[str | int, ...]"
 
 MOST_VALUES = 20
-"""Packets per question of which chosen fields are read."""
+"""Packets per question of which chosen fields are read, or that are read whole."""
+MOST_BYTES = 4_000_000
+"""Of whole packets, per question and port; one packet may be larger."""
 MOST_SPIKES = 20_000
 """Spikes per question; further ones are counted only."""
 MOST_PACKETS = 4000
@@ -59,8 +61,8 @@ class _Part(Protocol):
 
     @property
     def is_full(self) -> bool: ...
-    def add(self, packet: Any) -> None:
-        """Read a packet, of which anything may be wrong."""
+    def add(self, packet: Any, encode: Callable[[], bytes]) -> None:
+        """Read a packet, of which anything may be wrong; ``encode`` serialises it."""
 
     def answer(self) -> Mapping[str, Any]:
         """What was read, ready for JSON; empty if no packet has passed."""
@@ -78,7 +80,7 @@ class _Fields:
     def is_full(self) -> bool:
         return len(self._values) >= MOST_VALUES
 
-    def add(self, packet: Any) -> None:
+    def add(self, packet: Any, _: Callable[[], bytes]) -> None:
         values = [number_at(packet, path) for path in self._paths]
         self._values.append([time.monotonic(), *values])
 
@@ -98,12 +100,32 @@ class _One:
         self._found: Any = None
         self.is_full = False
 
-    def add(self, packet: Any) -> None:
+    def add(self, packet: Any, _: Callable[[], bytes]) -> None:
         self.is_full = True
         self._found = self._read(packet)
 
     def answer(self) -> Mapping[str, Any]:
         return {} if self._found is None else {self._name: self._encode(self._found)}
+
+
+class _Whole:
+    """Packets as ROS serialises them, each with the time when it passed (monotonic, seconds)."""
+
+    def __init__(self) -> None:
+        self._packets: list[tuple[float, bytes]] = []
+        self._room = MOST_BYTES
+
+    @property
+    def is_full(self) -> bool:
+        return len(self._packets) >= MOST_VALUES or self._room <= 0
+
+    def add(self, _: Any, encode: Callable[[], bytes]) -> None:
+        data = encode()
+        self._room -= len(data)
+        self._packets.append((time.monotonic(), data))
+
+    def answer(self) -> Mapping[str, Any]:
+        return {"packets": self._packets} if self._packets else {}
 
 
 class _Spikes:
@@ -123,7 +145,7 @@ class _Spikes:
     def is_full(self) -> bool:
         return self._packets >= MOST_PACKETS or self._count > 2 * MOST_SPIKES
 
-    def add(self, packet: Any) -> None:
+    def add(self, packet: Any, _: Callable[[], bytes]) -> None:
         senders, times = packet.senders, packet.times
         self._packets += 1
         if len(senders) != len(times):
@@ -161,7 +183,7 @@ class _Arrays:
     def is_full(self) -> bool:
         return self._packets >= MOST_ARRAYS
 
-    def add(self, packet: Any) -> None:
+    def add(self, packet: Any, _: Callable[[], bytes]) -> None:
         self._packets += 1
         numbers = _follow(packet, self._path)
         self._rows.append((time.monotonic(), array("f", numbers[:LONGEST_ARRAY]), len(numbers)))
@@ -181,6 +203,8 @@ class _Request:
             self._parts.append(_Fields(wanted["fields"]))
         if wanted.get("spikes"):
             self._parts.append(_Spikes())
+        if wanted.get("packets"):
+            self._parts.append(_Whole())
         if wanted.get("all"):
             self._parts.append(_One("all", lambda packet: all_fields(packet, most)))
         if wanted.get("image"):
@@ -192,12 +216,17 @@ class _Request:
         """Whether no further packet is wanted."""
         return all(part.is_full for part in self._parts)
 
-    def sample(self, packet: Any) -> None:
+    @property
+    def _wants_packet(self) -> bool:
+        packets = self._packets
+        return packets is not None and len(packets) < MOST_VALUES and self._room > 0
+
+    def sample(self, packet: Any, encode: Callable[[], bytes]) -> None:
         """Sample a packet; what cannot be read of it is no fault of the node's."""
         for part in self._parts:
             if not part.is_full:
                 try:
-                    part.add(packet)
+                    part.add(packet, encode)
                 except Exception as error:  # a plugin may have put anything in there
                     self._fault = f"{type(error).__name__}: {error}"
 
@@ -228,13 +257,17 @@ class _ArrayMessage:
 class Sampler:
     """Samples packets for observers.
 
+    Args:
+        encode: serialises a packet.
+
     Attributes:
         requests: by port (an output's name, or the topic of an external input), what is wanted by
             each observer; empty without requests.
         look_at_world: shows the simulated world of the node, ``None`` where it has none.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, encode: Callable[[Any], bytes]) -> None:
+        self._encode = encode
         self.requests: dict[str, list[_Request]] = {}
         self.look_at_world: WorldLook | None = None
         self._asked: dict[int, dict[str, _Request]] = {}
@@ -246,18 +279,19 @@ class Sampler:
             port = passage.port.external_topic if passage.way is Way.HEARD else passage.port.name
             name, is_array = str(port), passage.port.array is not None
 
-            def observe(packet: Any, _: bytes | None) -> None:
-                self.sample(name, _ArrayMessage(packet) if is_array else packet)
+            def observe(packet: Any, data: bytes | None) -> None:
+                shown = _ArrayMessage(packet) if is_array else packet
+                self.sample(name, shown, lambda: data or self._encode(packet))
 
             self._passages.append((name, passage, observe))
 
-    def sample(self, port: str, packet: Any) -> None:
-        """A packet passes. The thread of the hooks only."""
+    def sample(self, port: str, packet: Any, encode: Callable[[], bytes] = bytes) -> None:
+        """A packet passes; ``encode`` serialises it. The thread of the hooks only."""
         waiting = self.requests  # the next question, which may come meanwhile, brings another one
         requests = waiting.get(port)
         if requests is not None:
             for request in requests:
-                request.sample(packet)
+                request.sample(packet, encode)
             if all(request.is_met for request in requests):
                 del waiting[port]
 
@@ -269,8 +303,10 @@ class Sampler:
         Of each port: ``fields``, paths like ``pose.position.x`` or ``data[3]``, read of up to
         :data:`MOST_VALUES` packets; ``all``, every field of one packet (of arrays the first
         ``most_elements``); ``image``, a small picture of one packet; ``spikes``, the spikes
-        of all packets; ``arrays``, paths of arrays, read of a few packets. ``#world``
-        stands for the simulated world of the node, which is shown at once.
+        of all packets; ``arrays``, paths of arrays, read of a few packets; ``packets``, whole
+        packets as ROS serialises them, each with the time at which it passed, up to
+        :data:`MOST_VALUES` and :data:`MOST_BYTES`. ``#world`` stands for the simulated world of
+        the node, which is shown at once.
         """
         asked = self._asked.get(asker, {})
         answers = {port: answer for port, request in asked.items() if (answer := request.answer())}

@@ -135,6 +135,6 @@ def test_a_viewer_that_is_none_is_refused_with_all_that_there_are() -> None:
     refused = neuros("launch", str(CLOCK), "--viewer", "rviz")
     assert refused.returncode == 2
     assert refused.stderr == (
-        "neuros: viewer 'rviz': choose one of notes, dashboard, rerun, rqt_graph, rviz2 (did you"
-        " mean 'rviz2'?)\n"
+        "neuros: viewer 'rviz': choose one of notes, dashboard, foxglove, rerun, rqt_graph, rviz2"
+        " (did you mean 'rviz2'?)\n"
     )

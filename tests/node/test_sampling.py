@@ -33,14 +33,14 @@ def imu(z: float) -> Imu:
 
 
 def test_what_nobody_asks_for_is_not_looked_at() -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     assert not sampler.requests
     sampler.sample("imu", object())
     assert sampler.ask({}) == {}
 
 
 def test_a_simulated_world_is_shown_at_once_to_who_asks_for_it() -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     assert sampler.ask({WORLD: {}}) == {}  # this node has none
     sampler.look_at_world = lambda wanted, asker: {"seen": [wanted, asker]}
     assert sampler.ask({"imu": {}}) == {}
@@ -49,13 +49,13 @@ def test_a_simulated_world_is_shown_at_once_to_who_asks_for_it() -> None:
 
 
 def test_a_world_that_cannot_be_shown_is_told_and_ends_no_run() -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     sampler.look_at_world = lambda wanted, asker: {"z": 1 / 0}
     assert "ZeroDivisionError" in sampler.ask({WORLD: {}})[WORLD]["fault"]
 
 
 def test_chosen_fields_are_read_of_each_packet_up_to_a_limit() -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     wanted = {"imu": {"fields": ["angular_velocity.z", "angular_velocity.w"]}}
     sampler.ask(wanted)
     for number in range(MOST_VALUES + 5):
@@ -72,7 +72,7 @@ def test_chosen_fields_are_read_of_each_packet_up_to_a_limit() -> None:
 
 
 def test_each_observer_gets_what_it_asked_for() -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     sampler.ask({"imu": {"fields": ["angular_velocity.z"]}}, asker=1)
     sampler.sample("imu", imu(1.0))
     sampler.ask({"imu": {"all": True}, "camera": {"image": True}}, asker=2)
@@ -91,7 +91,7 @@ def test_a_question_that_comes_while_a_packet_is_looked_at_counts_from_the_next_
             sampler.ask({"camera": {"image": True}})
             return 1.0
 
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     sampler.ask({"imu": {"all": True, "fields": ["z"]}})
     for _ in range(MOST_VALUES - 1):
         sampler.sample("imu", Imu())
@@ -100,7 +100,7 @@ def test_a_question_that_comes_while_a_packet_is_looked_at_counts_from_the_next_
 
 
 def test_of_all_fields_and_of_images_one_packet_is_enough() -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     image = Image(width=2, height=1, step=2, encoding="mono8", data=array("B", b"\x01\x02"))
     sampler.ask({"camera": {"all": True, "image": True}})
     sampler.sample("camera", image)
@@ -112,7 +112,7 @@ def test_of_all_fields_and_of_images_one_packet_is_enough() -> None:
 
 
 def test_an_array_is_looked_at_as_the_message_that_ros_sees() -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     passage = Passage(Way.SENT, Port("state", "float64[2,3]"))
     sampler.attach(passage)
     sampler.ask({"state": {"all": True, "fields": ["data[4]"], "arrays": ["data"]}})
@@ -127,7 +127,7 @@ def test_an_array_is_looked_at_as_the_message_that_ros_sees() -> None:
 
 
 def test_what_cannot_be_read_is_told_and_harms_nobody() -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     sampler.ask({"camera": {"image": True}})
     sampler.sample("camera", Image(encoding="yuv422"))
     assert "encoding 'yuv422' are not shown" in sampler.ask({})["camera"]["fault"]
@@ -135,7 +135,7 @@ def test_what_cannot_be_read_is_told_and_harms_nobody() -> None:
 
 @pytest.mark.parametrize(("width", "height"), [(0, 0), (4, 0), (0, 4)])
 def test_an_image_without_pixels_is_told(width: int, height: int) -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     sampler.ask({"camera": {"image": True}})
     sampler.sample("camera", Image(width=width, height=height, step=4 * width, encoding="rgba8"))
     assert f"are not an image of {width} x {height}" in sampler.ask({})["camera"]["fault"]

@@ -1,1 +1,1 @@
-"""Viewers of a run: the dashboard, rqt_graph, RViz and Rerun."""
+"""Viewers of a run: the dashboard, Foxglove, rqt_graph, RViz and Rerun."""

@@ -26,8 +26,8 @@ class _Views(LaunchExtension):
             suggestions=_viewers,
             metavar="NAME",
             page=f"{_PAGE}#viewers",
-            help="show the run with this viewer: dashboard, rqt_graph, rviz2 or rerun; other"
-            " Python packages may add viewers",
+            help="show the run with this viewer: dashboard, foxglove, rqt_graph, rviz2 or rerun;"
+            " other Python packages may add viewers",
         ),
         Option(
             ("--dashboard",),
@@ -65,9 +65,10 @@ class _Views(LaunchExtension):
         subjects = {"--node-graph": "graph"} if options["node_graph"] else {}
         subjects |= {"--visualisations": "packets"} if options["visualisations"] else {}
         names, port = [*options["viewer"]], options["dashboard_port"]
-        if is_isolated and (subjects or {*names} - {"dashboard"}):
+        if is_isolated and (subjects or {*names} - {"dashboard", "foxglove"}):
             raise UsageError(
                 "--isolate with -g, -z or --viewer: they cannot see into the run; use --dashboard"
+                " or --viewer foxglove"
             )
         if options["dashboard"] or port is not None:
             names.append("dashboard")

@@ -1,4 +1,4 @@
-"""Programs beside a run: ``dashboard`` serves its page, ``rerun`` feeds a Rerun viewer.
+"""Programs beside a run: ``dashboard`` serves its page, ``rerun`` and ``foxglove`` feed viewers.
 
 The first line of their standard input has their settings as JSON.
 """
@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 _LAST_LOG_BYTES = 1 << 16
+_FOXGLOVE_S = 0.1
 
 
 def feed_rerun() -> None:
@@ -40,6 +41,37 @@ def feed_rerun() -> None:
     link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
     observe(link, sources, feed.show)
     feed.close()
+
+
+def serve_foxglove() -> None:
+    """Serve Foxglove apps until the run is over."""
+    from neuros.api.observation import answers
+    from neuros.backends.control_sockets import connect_by
+    from neuros.control import TO_OBSERVERS
+    from neuros.control.link import ControlLink
+    from neuros_dashboard.foxglove_feed import FoxgloveFeed
+
+    told = json.loads(sys.stdin.readline())
+    feed = FoxgloveFeed(
+        *(told["project"], told["host"], told["port"], told["names"], told["sources"])
+    )
+    logs = {name: Path(path) for name, path in told["logs"].items()}
+    log: _Log | None = None
+    link = ControlLink(connect_by(os.environ), TO_OBSERVERS, "the supervisor")
+    try:
+        for message in answers(link, feed.ask, _FOXGLOVE_S):
+            if message is not None:
+                feed.handle(message)
+            elif feed.wants_log:
+                log = log or _Log(logs)
+                feed.show_log(log.read())
+            elif log is not None:
+                log.close()
+                log = None
+        if log is not None:
+            feed.show_log(log.read())
+    finally:
+        feed.close()
 
 
 def serve_dashboard() -> None:
@@ -100,4 +132,4 @@ class _Log:
 
 
 if __name__ == "__main__":
-    {"dashboard": serve_dashboard, "rerun": feed_rerun}[sys.argv[1]]()
+    {"dashboard": serve_dashboard, "rerun": feed_rerun, "foxglove": serve_foxglove}[sys.argv[1]]()

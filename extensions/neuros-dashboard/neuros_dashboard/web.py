@@ -30,6 +30,7 @@ HOST = "127.0.0.1"
 PROGRAMS = "neuros_dashboard.programs"
 _RERUN_MEMORY = "512MB"
 _END_S = 3.0
+_FOXGLOVE_PORT = 8765
 _START_S, _RETRY_S = 30.0, 0.1
 
 
@@ -79,8 +80,7 @@ class _DashboardView:
                 "run": run.run_id,
                 "plan": project_view(run.project, run.names),
                 "names": run.names,
-                "logs": {name: str(path) for name, path in run.logs.items()}
-                | {LAUNCHER: str(run.folder / LAUNCHER_LOG)},
+                "logs": _logs(run),
                 "is_one_process": run.is_one_process,
                 "start_s": time.monotonic(),
                 "token": self._token,
@@ -162,7 +162,57 @@ class _Rerun(Viewer):
         return _RerunView()
 
 
+class _FoxgloveView:
+    """Serves a run to Foxglove apps on this machine, on Foxglove's own port if it is free."""
+
+    def __init__(self) -> None:
+        for port in (_FOXGLOVE_PORT, 0):
+            with socket.socket() as tried:
+                # As the server does: a port on which nobody listens any more is free.
+                tried.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                with contextlib.suppress(OSError):
+                    tried.bind((HOST, port))
+                    self._port = tried.getsockname()[1]
+                    break
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self, run: Shown, guardian: Guardian) -> str:
+        command = python_command(PROGRAMS, "foxglove", str(run.folder))
+        log = run.folder / "foxglove.log"
+        self._process = start_sidecar("server for Foxglove", command, log, run.environment)
+        _send_settings(
+            self._process,
+            {
+                "project": run.project.name,
+                "host": HOST,
+                "port": self._port,
+                "names": run.names,
+                "sources": project_view(run.project, run.names)["sources"],
+                "logs": _logs(run),
+            },
+        )
+        url = f"ws://{HOST}:{self._port}"
+        page = f"https://app.foxglove.dev/~/view?ds=foxglove-websocket&ds.url={url}"
+        return f"foxglove: {url}, in the app or at {page}"
+
+    def finish(self) -> None:
+        """End the process: by itself, with the run."""
+        if self._process is not None:
+            end_process(self._process, _END_S)
+
+
+class _Foxglove(Viewer):
+    name = "foxglove"
+    place = "Foxglove"
+
+    def prepare(self, back_end: BackEnd, subject: str | None, port: int | None) -> _FoxgloveView:
+        if find_spec("foxglove") is None:
+            raise EnvironmentFault(f"its SDK is not installed: {install_command('foxglove')}")
+        return _FoxgloveView()
+
+
 DASHBOARD = _Dashboard()
+FOXGLOVE = _Foxglove()
 RERUN = _Rerun()
 
 
@@ -179,6 +229,12 @@ def await_server(url: str) -> None:
             time.sleep(_RETRY_S)
         else:
             return
+
+
+def _logs(run: Shown) -> dict[str, str]:
+    """The files of the logs of nodes and launcher."""
+    logs = {**run.logs, LAUNCHER: run.folder / LAUNCHER_LOG}
+    return {name: str(path) for name, path in logs.items()}
 
 
 def _send_settings(process: subprocess.Popen[bytes], settings: Mapping[str, Any]) -> None:
@@ -257,20 +313,26 @@ def _topics(project: Project) -> Iterator[dict[str, Any]]:
 def _sources(node: Node, names: Names) -> Iterator[dict[str, Any]]:
     """Ports that can be sampled: outputs and external inputs."""
     for port in node.outputs:
-        yield _source(node, port, port.name, port.name)
+        external = port.external_topic
+        topic = (
+            f"/{node.name}/{port.name}" if external is None else names.resolve(external, node.name)
+        )
+        yield _source(node, port, port.name, port.name, topic)
     for port in node.inputs:
         if port.external_topic is not None:
             full = names.resolve(port.external_topic, node.name)
-            yield _source(node, port, port.external_topic, full)
+            yield _source(node, port, port.external_topic, full, full)
 
 
-def _source(node: Node, port: Port, key: str, title: str) -> dict[str, Any]:
+def _source(node: Node, port: Port, key: str, title: str, topic: str) -> dict[str, Any]:
     return {
         "node": node.name,
         "port": key,
         "name": f"{node.name}.{key}",
         "title": f"{node.name}.{title}",
+        "topic": topic,
         "type": port.type,
+        "ros_type": port.ros_type,
         "is_image": port.type in IMAGES,
         "is_spikes": port.type == SPIKES,
         "array": ARRAYS.get(port.ros_type, ""),
