@@ -101,6 +101,7 @@ BY_NAME = {
         ),
         "cli/test_validate_command.py",
         "doctor/test_checks.py",
+        "examples/test_seeker.py",
         "faults/",
         "fuzz/",
         "simulators/test_mujoco_opengl.py::TestDoctor",
