@@ -1,4 +1,4 @@
-"""Two nodes over dora-rs, if it is installed: ``./install.py --extras benchmark``."""
+"""Nodes over dora-rs, if it is installed: ``./install.py --extras benchmark``."""
 
 from __future__ import annotations
 
@@ -25,7 +25,6 @@ def run(
     receiver: str,
     variables: Mapping[str, object],
     *,
-    queue_size: int = 1,
     chosen: Sequence[int] | None = None,
 ) -> Any:
     """Let two programs send each other ``ball`` and ``back``; returns what they found out.
@@ -33,8 +32,28 @@ def run(
     Args:
         sender, receiver: programs ``dora_<name>.py``.
         variables: of their environment.
-        queue_size: packets that an input holds.
         chosen: the cores of the two; dora's own process is not pinned. ``None``: nothing is.
+
+    Raises:
+        Unavailable: if dora-rs is not installed.
+    """
+    (result,) = run_all([sender], [receiver], variables, queue_size=1, chosen=chosen)
+    return result
+
+
+def run_all(
+    senders: Sequence[str],
+    receivers: Sequence[str],
+    variables: Mapping[str, object],
+    *,
+    queue_size: int,
+    chosen: Sequence[int] | None = None,
+) -> list[Any]:
+    """Let every sender send ``ball`` to every receiver, which answers it; returns all results.
+
+    Args:
+        senders, receivers: each a program, and a number where there are several of it.
+        queue_size: packets that an input holds.
 
     Raises:
         Unavailable: if dora-rs is not installed.
@@ -43,32 +62,31 @@ def run(
     if importlib.util.find_spec("dora") is None or not command.exists():
         raise Unavailable("dora-rs is not installed (./install.py --extras benchmark)")
     with tempfile.TemporaryDirectory(prefix="neuros-benchmark-") as name:
-        folder, result = Path(name), Path(name) / "result.json"
-        environment = {key: str(value) for key, value in variables.items()}
-        environment["RESULT"] = str(result)
-        names = ((sender, "back", "ball", receiver), (receiver, "ball", "back", sender))
-        nodes = [_node(*each, queue_size, environment) for each in names]
+        folder = Path(name)
+        # A receiver answers on an output for each sender, so that no other one hears it.
+        nodes = [
+            *(_node(s, {r: f"{r}/{s}" for r in receivers}, ["ball"], queue_size) for s in senders),
+            *(_node(r, {s: f"{s}/ball" for s in senders}, senders, queue_size) for r in receivers),
+        ]
+        for node in nodes:
+            result = folder / f"{node['id']}.json"
+            node["env"] = {key: str(value) for key, value in variables.items()}
+            node["env"] |= {"RESULT": str(result), "RECEIVERS": str(len(receivers))}
         for node, core in zip(nodes, chosen or (), strict=False):
-            node["env"] = {**environment, "CORE": str(core)}
+            node["env"]["CORE"] = str(core)
         (folder / "flow.yml").write_text(json.dumps({"nodes": nodes}))  # JSON is YAML
         _run([str(command), "run", "flow.yml"], folder)
-        return json.loads(result.read_text())
+        return [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
 
 
 def _node(
-    name: str,
-    input_name: str,
-    output: str,
-    source: str,
-    queue_size: int,
-    environment: Mapping[str, str],
+    name: str, inputs: Mapping[str, str], outputs: Sequence[str], queue_size: int
 ) -> dict[str, Any]:
     return {
         "id": name,
-        "path": str(PROGRAMS / f"dora_{name}.py"),
-        "inputs": {input_name: {"source": f"{source}/{input_name}", "queue_size": queue_size}},
-        "outputs": [output],
-        "env": environment,
+        "path": str(PROGRAMS / f"dora_{name.rstrip('0123456789')}.py"),
+        "inputs": {key: {"source": s, "queue_size": queue_size} for key, s in inputs.items()},
+        "outputs": [*outputs],
     }
 
 

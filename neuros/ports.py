@@ -426,6 +426,10 @@ class NodeContext(Protocol):
     def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
         """Wait for time 0 of the run; False if ``cancelled()`` or the node ends. Other threads."""
 
+    @property
+    def is_ending(self) -> bool:
+        """Whether no further hook starts. Any thread."""
+
     def reading(self, value: int) -> int:
         """A reading of what goes on by itself: that of the run in a replay, else the value."""
 

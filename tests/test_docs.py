@@ -190,9 +190,9 @@ def test_the_page_that_says_more_on_an_option_exists(option: Option) -> None:
 
 
 def files_named_in(
-    value: Any, keys: tuple[str, ...] = ("plugin", "script", "network")
+    value: Any, keys: tuple[str, ...] = ("plugin", "script", "network", "policy")
 ) -> Iterator[str]:
-    """The plugins and scripts that a project, or node, names."""
+    """The plugins, or what is in their place, and scripts that a project, or node, names."""
     if isinstance(value, dict):
         yield from (value[key] for key in keys if isinstance(value.get(key), str))
         for each in value.values():

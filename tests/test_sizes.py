@@ -28,15 +28,15 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 53_270)
+    hold("lines of neuros/", lines(NEUROS), 53_550)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 72_170)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 74_580)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 91_170)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 93_390)
 
 
 def test_private_functions_that_are_used_once() -> None:

@@ -1,4 +1,4 @@
-"""A node of dora-rs: answers what arrives and counts it for SECONDS; RESULT gets the rate per s."""
+"""A node of dora-rs: answers each sender and counts for SECONDS; RESULT gets the rate per s."""
 
 import json
 import os
@@ -24,7 +24,7 @@ def main() -> None:
             start_ns = now_ns
         elif now_ns - start_ns >= length_ns:
             break
-        node.send_output("back", answer)
+        node.send_output(event["id"], answer)
     with open(os.environ["RESULT"], "w", encoding="utf-8") as file:
         json.dump(packets / (now_ns - start_ns) * 1e9, file)
 

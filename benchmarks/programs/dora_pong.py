@@ -16,7 +16,7 @@ def main() -> None:
         if event["type"] == "STOP":
             break
         if event["type"] == "INPUT":
-            node.send_output("back", answer)
+            node.send_output(event["id"], answer)
 
 
 if __name__ == "__main__":

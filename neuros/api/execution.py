@@ -188,7 +188,7 @@ class Execution:
             duration = self._plan.request.end
             self._console.follow(Progress(outcome, duration.wall_s, duration.sim_s))
             for view in self._views:
-                view.start(self._shown(), guardian, self._console.log)
+                view.start(self._shown(), guardian, self._console.tell)
             supervisor.run()
         except BaseException as error:  # for run.json; the command line shows the error
             outcome.exit_code = EXIT_ENVIRONMENT if isinstance(error, EnvironmentFault) else 1
@@ -437,16 +437,19 @@ class Console:
             self._writer.finish(self._is_enough, self._patience_s)
 
     def log(self, severity: str, text: str) -> None:
-        """Write a record of the launcher, after what nodes have logged so far.
+        """Write a record of the launcher, after what nodes have logged so far, and to its log.
 
-        A record of severity ``DEBUG`` goes to the log of the launcher only.
+        A record of severity ``DEBUG`` goes to the log only.
         """
-        if severity == "DEBUG":
-            record = format_record(severity, "neuros", text)
-            with contextlib.suppress(OSError), open(self._log_file, "ab") as log:
-                log.write(f"{record}\n".encode(errors="backslashreplace"))
-            return
-        self.poll()
+        record = format_record(severity, "neuros", text)
+        with contextlib.suppress(OSError), open(self._log_file, "ab") as log:
+            log.write(f"{record}\n".encode(errors="backslashreplace"))
+        if severity != "DEBUG":
+            self.poll()
+            self.tell(severity, text)
+
+    def tell(self, severity: str, text: str) -> None:
+        """Write a record to the console only: addresses with tokens are kept nowhere."""
         self.write(format_record(severity, "neuros", text, layout=self._layout) + "\n")
 
     def follow(self, progress: Progress) -> None:
@@ -473,7 +476,7 @@ class Console:
                 self._line = progress.bar(columns, is_ascii=self._is_ascii)
                 self._writer.write(f"{_CLEAR}{self._line}" if self._line else "")
             elif text := progress.text():
-                self.log("INFO", text)
+                self.tell("INFO", text)
         return self._tail.poll()
 
     def finish(self, patience_s: float | None) -> None:

@@ -30,7 +30,7 @@ from neuros.project.in_python import PythonProject
 from neuros.project.load import LoadedProject, load_project
 from neuros.project.loops import Loops, modules_beside
 from neuros.project.message_types import unknown_type
-from neuros.project.model import MODEL_FIELDS, NETWORK_MODULE, Node, Project
+from neuros.project.model import MODEL_FIELDS, Node, Project
 from neuros.project.paths import is_missing, modules_here, why_no_module
 from neuros.project.plugin_files import PluginFile, plugins_of
 from neuros.project.scanner import display_name, problem_in
@@ -89,8 +89,7 @@ def load_with_messages(
     if reads_plugins:
         for node in nodes:
             if text := PLUGIN_CHECKS.missing(node.module):
-                key = "network" if node.module == NETWORK_MODULE else "plugin"
-                problems.append(problem_in(node.file, f"{node.pointer}/{key}", text))
+                problems.append(problem_in(node.file, f"{node.pointer}/{node.plugin_key}", text))
         problems += [problem for node, check in checks for problem in check.problems(node)]
         if problems:
             raise ProjectError(problems)

@@ -5,7 +5,7 @@
     runs/<project>/<utc time>/     or exactly what -o names
         project.json               the expanded project
         run.json                   the record of the run
-        launcher.log               stacks that are too long for the console
+        launcher.log               its records, and stacks that are too long for the console
         <node>/node.json           project, connections and settings of the node
         <node>/node.log            its output and log
         <node>/kept/               what its plugin keeps, restored/: what was restored to it

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import contextlib
+import ctypes
 import faulthandler
 import gc
 import json
@@ -20,6 +22,9 @@ from neuros.project.split import node_files_from_json
 from neuros.recording.provenance import note_versions
 from neuros.registry import TRANSPORTS
 from neuros.transport.imports_when_used import imports_when_used
+
+# Parameters of mallopt(3), in malloc.h.
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
 def add_node(node: argparse.ArgumentParser) -> None:
@@ -57,8 +62,23 @@ def load_messages(*names: str) -> None:
             make_packet(name)
 
 
+def keep_freed_memory() -> None:
+    """Have glibc keep up to 64 MB of freed memory, unless the environment sets its limits.
+
+    By default it returns what is free at the end of the heap at once. A node with a queue of images
+    (0.9 MB each) then has 90 page faults per packet, for a third of the processor time of a packet.
+    """
+    if any(name.startswith("MALLOC_") for name in os.environ):
+        return
+    with contextlib.suppress(AttributeError):  # another C library
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_M_MMAP_THRESHOLD, 32 << 20)  # its largest value; larger blocks are always returned
+        mallopt(_M_TRIM_THRESHOLD, 64 << 20)
+
+
 def _run_node(options: argparse.Namespace) -> int:
     """Run the nodes of the given ``node.json`` files until they are asked to end."""
+    keep_freed_memory()
     # At exit Python closes the files that a plugin left open, but not among frozen objects.
     atexit.register(gc.unfreeze)
     faulthandler.enable()  # a plugin that crashes in C leaves its Python stack in the log

@@ -24,7 +24,9 @@ each other in a circle would rise by one delay per message only.
 
 Old states are safe, so a node tells a neighbour only what that may wait for (:meth:`Horizon.news`):
 what it has sent to it, and, where a node waits for an event, each state that keeps it waiting. Two
-nodes that only send to each other tell each other nothing else.
+nodes that only send to each other tell each other nothing else. A node that waits asks for that by
+its own state; it is patient with a neighbour whose last messages all brought packets, since the
+next one will most probably bring what it waits for, unasked.
 
 The time of the machine decides how long a node waits, and never what it does.
 """
@@ -47,6 +49,10 @@ _MOST_UNCONFIRMED = 64
 """Messages that a node receives before it says so: bounds what states list."""
 _LAG_NS = END_NS // 2
 """A node that is so much further than it has told says so: others wait for no end from it."""
+
+
+_TRUSTED = 2
+"""So many messages in a row with packets, and a node is patient with their sender."""
 
 
 class Channel(NamedTuple):
@@ -171,6 +177,7 @@ class Horizon:
         neighbours: the nodes at the other ends of its channels.
         begun_ns: time 0 of the run, once that has come.
         causes: the nodes that keep it from the event that it asked for last.
+        withholds: whether it has been patient with one of them since it last told all it had to.
     """
 
     def __init__(self, node: str, inward: Mapping[int, str], outward: Sequence[Channel]) -> None:
@@ -196,8 +203,11 @@ class Horizon:
         self._told: dict[str, dict[str, KnownState]] = {name: {} for name in self.neighbours}
         self._since_ns: dict[str, int] = {}
         self._first: dict[str, tuple[int, str]] = {}
+        # By neighbour, how many of its last messages brought packets, without another in between.
+        self._with_packets = dict.fromkeys(self.neighbours, 0)
         self.begun_ns: int | None = None
         self.causes: Sequence[str] = ()
+        self.withholds = False
 
     # ------------------------------------------------------------------ what happens
 
@@ -225,9 +235,14 @@ class Horizon:
         inbox = self._inboxes.get(channel)
         return None if inbox is None else inbox.arrival_ns(self._received[channel])
 
-    def learn(self, states: Iterable[KnownState]) -> list[Answer]:
-        """Keep the states that are newer than what is known; returns new acknowledgements."""
+    def learn(self, states: Sequence[KnownState]) -> list[Answer]:
+        """Keep the states that are newer than what is known; returns new acknowledgements.
+
+        Args:
+            states: what a neighbour tells, its own state first.
+        """
         answers: list[Answer] = []
+        sender, has_packets = states[0].node, False
         for state in states:
             known = self._states.get(state.node)
             if state.node == self.node or (known is not None and known.version >= state.version):
@@ -237,9 +252,14 @@ class Horizon:
                 if channel.target == state.node:
                     self._forget(name, state)
             for outbox in state.outboxes:
-                if outbox.channel.target == self.node:
-                    self._inboxes[outbox.channel.number] = outbox
+                number, target, _, window = outbox.channel
+                if target == self.node:
+                    old = self._inboxes.get(number)
+                    if state.node == sender and not window:
+                        has_packets |= outbox.sent > (0 if old is None else old.sent)
+                    self._inboxes[number] = outbox
                     answers.extend(self._new_answers(outbox))
+        self._with_packets[sender] = self._with_packets[sender] + 1 if has_packets else 0
         return answers
 
     # ------------------------------------------------------------------ what follows
@@ -265,26 +285,31 @@ class Horizon:
         return self._own
 
     def news(
-        self, moment: Moment, *, is_all: bool = False
+        self, moment: Moment, *, is_all: bool = False, is_patient: bool = False
     ) -> Iterator[tuple[str, list[KnownState]]]:
         """The neighbours that wait for states, each with all that are known.
 
         Args:
             is_all: whether all get what is new, also if they wait for nothing.
+            is_patient: whether the node, if it waits, asks only those that tell nothing unasked.
         """
         own = self.state(moment)
-        waiting = [(s.moment.waits_ns, s.moment.causes) for s in self._states.values()]
+        pauses = [(s.node, s.moment.waits_ns, s.moment.causes) for s in self._states.values()]
         if moment.free_ns > moment.now_ns:
-            waiting += [(self._pending_ns(s), (self.node,)) for s in self._states.values()]
+            pauses += [(s.node, self._pending_ns(s), (self.node,)) for s in self._states.values()]
+        self.withholds = False
         for name in self.neighbours:
             told = self._told[name]
+            # Another neighbour that waits is told itself.
+            waiting = [(t, c) for node, t, c in pauses if node == name or node not in self._told]
+            trust = self._with_packets[name] >= _TRUSTED if is_patient else False
             others = [state for node, state in self._states.items() if node != name]
             new = [
                 state
                 for state in (own, *others)
                 if told.get(state.node) is not state and (state is own or name not in state.near)
             ]
-            if new and (is_all or any(self._concerns(name, each, waiting) for each in new)):
+            if new and (is_all or any(self._concerns(name, each, waiting, trust) for each in new)):
                 told.update((state.node, state) for state in (own, *others))
                 self._since_ns.pop(name, None)
                 if moment.free_ns >= 0:  # what they are told lasts until the end of the hook
@@ -386,7 +411,11 @@ class Horizon:
         return -1 if time_ns == NEVER_NS else max(time_ns, state.moment.since_ns)
 
     def _concerns(
-        self, name: str, state: KnownState, waiting: Sequence[tuple[int, Sequence[str]]]
+        self,
+        name: str,
+        state: KnownState,
+        waiting: Sequence[tuple[int, Sequence[str]]],
+        trust: bool,
     ) -> bool:
         """Whether a neighbour, or a node behind it, may wait for a new state of a node."""
         old = self._told[name].get(state.node)
@@ -401,12 +430,13 @@ class Horizon:
                 return True
             since_ns = self._since_ns.get(name, NEVER_NS) + self._least_delay_ns
         # Also if it waited for the same before: an older state may have come on another way since.
-        if now.waits_ns >= 0 and (
-            state is not self._own
-            or name in now.causes
-            or not self._told.keys() >= {*now.causes}  # behind a neighbour
-        ):
-            return True
+        if now.waits_ns >= 0:
+            if state is not self._own or not self._told.keys() >= {*now.causes}:
+                return True  # for a node behind a neighbour
+            if name in now.causes:
+                if not trust:
+                    return True
+                self.withholds = True
         if now.now_ns - before.now_ns >= _LAG_NS:
             return True
         return any(since_ns <= time_ns and state.node in causes for time_ns, causes in waiting)

@@ -7,6 +7,7 @@ import {binOf, buffer, SpikeTrain} from "./spikes.js";
 const COLUMNS = 100;
 const MOST_ROWS = 256;
 const SMOOTH_SHARE = 1 / 16;
+export const LEAST_RING = 8; // with fewer numbers, the largest one is no bump
 const COLOURS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
 const PEAK = "#ffffff";
 
@@ -16,8 +17,9 @@ export class Activity {
   static wants = (source, {field = source.array}) => source.is_spikes && !field
     ? {spikes: true} : {array: field};
 
-  constructor(box, {seconds = 10, field}, source) {
+  constructor(box, {seconds = 10, field}, source, clock = "wall clock") {
     this.seconds = seconds;
+    this.clock = clock; // of arrays; spikes have times of their own
     this.field = field ?? source.array;
     this.canvas = element("canvas", {class: "body"});
     box.append(this.canvas);
@@ -31,9 +33,10 @@ export class Activity {
     else if (sample.arrays?.[this.field]) this.take(sample.arrays[this.field]);
     else return null;
     this.draw();
-    if (this.peak === null) return "empty";
+    if (!this.size) return "empty";
     const cut = this.length > this.size ? `; of ${this.length}, the first ${this.size}` : "";
-    return `peak at ${this.peak} of ${this.size}, ${number(this.low)} to ${number(this.high)}${cut}`;
+    const peak = this.peak === null ? `${this.size} numbers` : `peak at ${this.peak} of ${this.size}`;
+    return `${peak}, ${number(this.low)} to ${number(this.high)}${cut}`;
   }
 
   forget() {
@@ -112,7 +115,7 @@ export class Activity {
     });
     plane.paint(picture, 0);
     const peaks = columns.map(({timeS, values}) => [timeS, peakOf(values), values.length])
-      .filter(([, peak]) => peak !== null);
+      .filter(([, peak, length]) => peak !== null && length >= LEAST_RING);
     plane.dots(peaks.map(([timeS, peak, length]) =>
       [x(timeS), plane.height * (1 - (peak + 0.5) / length)]), PEAK, 3);
     if (peaks.length) {
@@ -122,7 +125,7 @@ export class Activity {
     }
     plane.levels(0, plane.height, String(size - 1), "0",
       this.rows.length ? "element" : "neuron");
-    plane.times(beginS, endS);
+    plane.times(beginS, endS, this.rows.length ? this.clock : "time of spikes");
     this.canvas.dataset.columns = columns.length;
   }
 

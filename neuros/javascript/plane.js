@@ -19,19 +19,23 @@ export class Plane {
     this.canvas.width = Math.max(LEFT + RIGHT + 10, this.canvas.clientWidth);
     this.canvas.height = Math.max(TOP + BOTTOM + 10, this.canvas.clientHeight);
     this.context.font = "11px system-ui, sans-serif";
-    this.context.fillStyle = "#5b6773";
+    this.context.fillStyle = this.ink = getComputedStyle(this.canvas).color;
   }
 
-  // Times below the plane, in seconds.
-  times(beginS, endS) {
+  // Times below the plane, in seconds, and of which clock they are.
+  times(beginS, endS, clock) {
     const step = stepOf((endS - beginS) / TICKS);
     const digits = Math.max(0, -Math.floor(Math.log10(step)));
+    const y = this.canvas.height - 4;
+    this.context.textAlign = "right";
+    this.context.fillText(clock, this.canvas.width, y);
+    const rightEnd = this.canvas.width - this.context.measureText(clock).width - 8;
     this.context.textAlign = "center";
     for (let tick = Math.ceil(beginS / step) * step; tick <= endS; tick += step) {
       const x = LEFT + this.width * (tick - beginS) / (endS - beginS);
       const label = `${tick.toFixed(digits)} s`;
       const half = this.context.measureText(label).width / 2;
-      this.context.fillText(label, Math.min(x, this.canvas.width - half), this.canvas.height - 4);
+      if (x + half < rightEnd) this.context.fillText(label, x, y);
     }
   }
 
@@ -76,7 +80,7 @@ export class Plane {
     for (const [x, y] of points) {
       this.context.fillRect(LEFT + x - size / 2, TOP + y - size / 2, size, size);
     }
-    this.context.fillStyle = "#5b6773";
+    this.context.fillStyle = this.ink;
   }
 
   remove() { this.observer.disconnect(); }

@@ -65,7 +65,7 @@ export class Raster {
     plane.line(rates.map((each, place) => [
       plane.width * ((firstBin + place + 0.5) * binS - beginS) / seconds,
       bottom - (bottom - top) * each / most]), "#c2571a");
-    plane.times(beginS, endS);
+    plane.times(beginS, endS, "time of spikes");
     this.rate = rates.slice(-BINS / 5).reduce((sum, each) => sum + each, 0)
       / Math.min(BINS / 5, rates.length);
     this.canvas.dataset.spikes = drawn;

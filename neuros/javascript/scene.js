@@ -5,7 +5,7 @@ const SEGMENTS = 24;
 const POSE = 7; // x, y, z; w, x, y, z of the quaternion
 const CONTACT = 6; // point and normal
 const MOST_CONTACTS = 500;
-const MOST_STEP_BACK = 8;
+const STEP_BACK = 2.5; // from what the camera follows, in its reaches
 const [SPOT, DIRECTIONAL] = [0, 1];
 // MuJoCo adds up colours as they are, without a gamma; Three.js divides what falls on them by pi.
 const LIGHT = Math.PI;
@@ -93,7 +93,7 @@ export class Scene {
     this.camera = this.cameras[camera] ?? this.free;
     this.controls.enabled = this.camera === this.free;
     this.followed = this.bodies[body];
-    if (this.followed && !this.hasMoved) this.move(this.followed.position, this.controls.target);
+    if (this.followed) this.approach(body);
     this.before = this.followed?.position.clone();
     this.resize();
   }
@@ -102,7 +102,7 @@ export class Scene {
   lookAs(other) {
     this.free.position.copy(other.free.position);
     this.controls.target.copy(other.controls.target);
-    this.hasMoved = true;
+    this.approached = other.approached;
     this.controls.update();
   }
 
@@ -114,15 +114,16 @@ export class Scene {
     this.controls.update();
   }
 
-  // Step back until all that moves by itself is in view, unless it is far away.
-  fit() {
-    const {extent} = this.geometry.view;
+  // Go so near to a body that it fills a part of the view, unless the camera is at it already.
+  approach(body) {
+    const {bodies, roots, reaches = [], view} = this.geometry;
+    if (this.approached === bodies[body].name) return;
+    this.approached = bodies[body].name;
     const {target} = this.controls;
-    const far = Math.max(...this.geometry.roots.map(
-      (body) => this.bodies[body].position.distanceTo(target)));
-    const distance = 1.5 * Math.min(far, MOST_STEP_BACK * extent);
     const way = this.free.position.clone().sub(target);
-    this.free.position.copy(target).add(way.setLength(Math.max(distance, way.length())));
+    target.copy(this.followed.position);
+    way.setLength(STEP_BACK * (reaches[roots.indexOf(body)] || view.extent / 2));
+    this.free.position.copy(target).add(way);
     this.controls.update();
   }
 
@@ -150,8 +151,6 @@ export class Scene {
       this.move(this.followed.position, this.before);
       this.before.copy(this.followed.position);
     }
-    if (!this.hasMoved) this.fit();
-    this.hasMoved = true;
     this.isDirty = true;
   }
 
@@ -197,6 +196,7 @@ export class Scene {
       camera.updateProjectionMatrix();
     }
     this.isDirty = true;
+    this.draw(); // now: a canvas that gets another size is black
   }
 
   material(geom, textures, known) {

@@ -433,6 +433,17 @@ class NodeHandle:
         """End the node as failed, from any thread: for errors that no hook can raise."""
         self._services.fail_from_thread(error)
 
+    @property
+    def is_ending(self) -> bool:
+        """Whether no further hook starts. Any thread."""
+        return self._services.is_ending
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether the run is paused, as from the dashboard or by a session. Any thread."""
+        engine = self._services.engine
+        return engine is not None and engine.is_paused
+
     def wait_until_active(self, cancelled: Callable[[], bool]) -> bool:
         """Wait, in another thread, for time 0 of the run: every node of the project is ready.
 

@@ -465,7 +465,7 @@ class NodeRuntime:
             self._middleware.packets.packet_class(port.type)
         specs: Sequence[HookSpec] = hook_specs_of(dict(enumerate(node.hooks)))
         if not node.hooks:
-            specs = load_plugin(node.plugin, self.name, node.module)
+            specs = load_plugin(node)
         for spec in specs:
             text, hint = node.misfit(spec.is_batch, bool(spec.inputs or spec.outputs))
             if text:

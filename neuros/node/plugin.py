@@ -14,9 +14,11 @@ import sys
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from neuros.errors import NO_WAITING, NeurosError, NodeError, PluginError
 from neuros.hooks import HookSpec, hook_specs_of
+from neuros.project.model import Node
 
 PREFIX = "neuros_plugin_"
 """Of the last word in the module name of each plugin."""
@@ -27,10 +29,13 @@ _GONE_MODULES = {
 }
 
 
-def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[HookSpec]:
-    """Import a plugin under a name of its node's own, and return its hooks in order.
+def load_plugin(node: Node) -> Sequence[HookSpec]:
+    """Import the plugin of a node under a name of the node's own, and return its hooks in order.
 
-    One of an installed package (``module_name``) is imported anew, too, within its package; what it
+    A plugin whose hooks depend on the ports of its node has a function ``neuros_hooks(node)``. It
+    gets the node as its file declares it, and returns marked functions.
+
+    A module of an installed package is imported anew, too, within its package; what it
     imports itself is shared with the other nodes of the process.
 
     Raises:
@@ -38,7 +43,8 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
             declares no hooks.
         HookError: if one of its hooks is declared wrongly.
     """
-    package, name = module_name.rpartition(".")[0], f"{PREFIX}{node_name}"
+    path, module_name = node.plugin, node.module
+    package, name = module_name.rpartition(".")[0], f"{PREFIX}{node.name}"
     if module_name and path == Path():
         raise no_module(module_name)
     full_name = f"{package}.{name}" if package else name
@@ -57,6 +63,9 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
         if package:
             importlib.import_module(package)
         spec.loader.exec_module(module)
+        functions: Mapping[Any, Any] = vars(module)
+        if make := functions.get("neuros_hooks"):
+            functions = {**functions, **dict(enumerate(make(node)))}
     except NeurosError:
         raise
     except BaseException as error:
@@ -72,7 +81,7 @@ def load_plugin(path: Path, node_name: str, module_name: str = "") -> Sequence[H
         ) from error
     finally:
         sys.setdlopenflags(flags)
-    specs = hook_specs_of(vars(module))
+    specs = hook_specs_of(functions)
     if not specs:
         raise PluginError(
             f"{path}: declares no hooks: mark functions with @neuros_function or @neuros_tick"

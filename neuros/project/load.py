@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,8 +30,7 @@ from neuros.project.message_types import (
 )
 from neuros.project.model import (
     FINALISE_S,
-    NETWORK,
-    NETWORK_MODULE,
+    PLUGIN_KEYS,
     Access,
     Budgets,
     Connection,
@@ -60,11 +60,16 @@ from neuros.project.timing import REAL
 from neuros.project.validate import apply_timing, violations
 
 STANDARD_CONTAINERS = frozenset(
-    {"neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow", "neuros_nir"}
+    {
+        *("neuros_python", "neuros_mujoco", "neuros_nest", "neuros_tensorflow"),
+        *("neuros_nir", "neuros_onnx"),
+    }
 )
 """NeuROS's own images: they have the message packages that this machine has."""
 PROJECT_FILE = "project.json"
 _T = TypeVar("_T")
+_ELSEWHERE = re.compile(r"[a-z]+:")
+"""Begins the name of what a library finds, in the place of a file: ``lerobot:user/name``."""
 _OWN_VARIABLES = frozenset(
     f"NEUROS_{name}" for name in ("RUN_ID", "RUN_DIR", "CONTROL", "ELSEWHERE")
 )
@@ -109,10 +114,15 @@ class _Builder:
         keys, cores = element.plain, (core.value for core in element.items("affinity"))
         hooks = self._hooks(element)
         module, plugin = ("", file_of(hooks)) if hooks else self._plugin(element)
-        if element.member("network") is not None:
-            module, plugin = NETWORK_MODULE, find_module(NETWORK_MODULE) or Path()
-            environment[NETWORK] = str(self._file(element, "network") or "")
-            paths.append(NETWORK)
+        for key, own in PLUGIN_KEYS.items():
+            if element.member(key) is None:
+                continue
+            module, plugin = own, find_module(own) or Path()
+            if _ELSEWHERE.match(name := element.string(key) or ""):
+                environment[key.upper()] = name
+            else:
+                environment[key.upper()] = str(self._file(element, key) or "")
+                paths.append(key.upper())
         return Node(
             name=element.string("name") or "",
             container=container_in_place_of(element.string("container") or ""),

@@ -22,9 +22,13 @@ from neuros.project.timing import REAL, VIRTUAL, Distribution
 Value: TypeAlias = "bool | int | float | str | tuple[bool | int | float | str, ...]"
 """The value of a ROS parameter."""
 
-NETWORK_MODULE = "neuros.snn.nir.plugin"
-"""The plugin of nodes with ``"network"``; the file is in the variable :data:`NETWORK`."""
-NETWORK = "NETWORK"
+PLUGIN_KEYS: Mapping[str, str] = MappingProxyType(
+    {"network": "neuros.snn.nir.plugin", "policy": "neuros.policies.plugin"}
+)
+"""Keys of a node in the place of ``"plugin"``, and their plugins, which extensions bring.
+
+The file that such a key names is in the variable of its name in capitals, ``NETWORK``.
+"""
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 _NO_NAMES = Names()
@@ -156,12 +160,17 @@ class Node:
         return _named(self.outputs, name)
 
     @property
+    def plugin_key(self) -> str:
+        """The key that names the plugin: ``plugin``, or one of :data:`PLUGIN_KEYS`."""
+        return next((key for key, own in PLUGIN_KEYS.items() if own == self.module), "plugin")
+
+    @property
     def plugin_name(self) -> str:
-        """The name of the plugin, or of the network in its place, for messages."""
+        """The name of the plugin, or of the file in its place, for messages."""
         if self.hooks:
             return ", ".join(getattr(hook, "__name__", repr(hook)) for hook in self.hooks)
-        if self.module == NETWORK_MODULE:
-            return Path(self.environment.get(NETWORK, "")).name
+        if self.plugin_key in PLUGIN_KEYS:
+            return Path(self.environment.get(self.plugin_key.upper(), "")).name
         return self.module or self.plugin.name
 
     @property

@@ -5,7 +5,8 @@ It is :mod:`neuros.runtime.virtual` with one node, whose events wait until its h
 stands in the states of nodes, and so do acknowledgements. States travel on a topic for each pair
 of neighbours, ``/neuros/<node>/virtual_time/<neighbour>``, as MessagePack in a latched
 ``std_msgs/msg/UInt8MultiArray``. Each message has all that the node knows, so that only the newest
-one counts.
+one counts. Where packets go to the neighbour, too, the last of them carries the states, unless
+others read its topic.
 """
 
 from __future__ import annotations
@@ -13,13 +14,15 @@ from __future__ import annotations
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from heapq import heappop
 from typing import Any
 
 import msgspec
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.subscription import Subscription
 from std_msgs.msg import UInt8MultiArray
 
 from neuros.engine.horizon import (
@@ -43,6 +46,7 @@ from neuros.transport.lean_node import LeanNode
 from neuros.transport.ros import ReceivingLink, RosTransport, SendingLink
 from neuros.transport.ros_loop import RosLoop
 from neuros.transport.ros_process import RosProcess, RosTransportKind
+from neuros.transport.schema import schema
 
 _TURN_NS = 1_000_000
 """How long events of the node may keep those of ROS waiting, besides the hook that runs."""
@@ -52,6 +56,18 @@ _TELL_ALL_S = 0.2
 
 _ARRAY = struct.Struct("<4sIII")
 """A ``std_msgs/msg/UInt8MultiArray`` in little-endian CDR, up to its bytes: no dimensions."""
+
+_STATED_MARK = b"NV"
+"""Option bytes of the encapsulation header of a packet that carries states."""
+
+_STATED = struct.Struct("<2s2sI")
+"""Before a packet that carries states: representation, mark, and the size of the states."""
+
+_ALIGNMENT = 8
+"""Of the packet behind the states, in bytes."""
+
+_PATIENCE_NS = 2_000_000
+"""How long a node waits before it asks a neighbour that sends much, by the clock of the machine."""
 
 _ALL = QoSProfile(
     history=QoSHistoryPolicy.KEEP_ALL,
@@ -86,8 +102,12 @@ class RosNodeTime(NodeTime):
         self._loop.awaited = awaited
 
     def step(self, time_ns: int) -> None:
-        self._loop.horizon.handle(time_ns)
-        super().step(time_ns)
+        # An acknowledgement that comes late changes nothing: as if it had come in time.
+        while self._events and self._events[0][0] < self.instant_ns:
+            heappop(self._events)[-1]()
+        if self.next_ns is not None and self.next_ns <= time_ns:
+            self._loop.horizon.handle(time_ns)
+            super().step(time_ns)
 
     @property
     def must_look(self) -> bool:  # type: ignore[override]
@@ -117,7 +137,7 @@ class RosVirtualLoop(VirtualLoop):
 
     Attributes:
         horizon: of the node.
-        publish: publishes states for a neighbour.
+        publish: publishes states, encoded, for a neighbour.
         awaited: connections whose acknowledgements could change which hooks start.
         is_ready: whether the node has run its initialise hooks.
         why_waiting: which node keeps this one from its next event; empty if none does.
@@ -127,7 +147,7 @@ class RosVirtualLoop(VirtualLoop):
         super().__init__(seed)
         self._ros_loop = ros
         self.horizon: Horizon
-        self.publish: Callable[[str, Sequence[KnownState]], None]
+        self.publish: Callable[[str, bytes], None]
         self.awaited: Callable[[], Sequence[Connection]] = list
         # By channel of acknowledgements, what takes in one that has arrived.
         self.answers: dict[int, Callable[[Answer], None]] = {}
@@ -136,7 +156,11 @@ class RosVirtualLoop(VirtualLoop):
         self._has_posted = False
         # By connection, what has come, and whose time of arrival is not known yet.
         self._arrived: dict[Connection, deque[Event]] = {}
+        # By neighbour, packets that leave with the next states.
+        self._leaving: dict[str, list[tuple[VirtualSendingLink, bytes]]] = {}
         self._waits_ns = -1
+        self._patience: tuple[int, int] | None = None  # when it is over, and for which event
+        ros.add_timer(self._patience_ends_ns, self._lose_patience)
         self._at_zero: Event | None = None
         self._drain: Event | None = None  # what a node does when the end reaches it
         self._is_draining = False
@@ -230,20 +254,42 @@ class RosVirtualLoop(VirtualLoop):
             return True
         return super().step()
 
-    def tell(self, free_ns: int | None = None) -> None:
+    def send(self, link: VirtualSendingLink, target: str, data: bytes) -> None:
+        """Publish a packet for a neighbour with the next states, which tell when it arrives."""
+        self._leaving.setdefault(target, []).append((link, data))
+
+    def tell(self, free_ns: int | None = None, *, is_patient: bool = True) -> None:
         """Tell the neighbours the state of the node, as far as they may wait for it.
 
         Args:
             free_ns: when the hook that starts now ends; ``None``: none starts now.
+            is_patient: whether to ask only neighbours that tell nothing unasked.
         """
-        for name, states in self.horizon.news(self._moment(free_ns)):
-            self.publish(name, states)
+        self._publish(self.horizon.news(self._moment(free_ns), is_patient=is_patient))
+        if self.horizon.withholds and self._patience is None:
+            self._patience = time.monotonic_ns() + _PATIENCE_NS, self._waits_ns
 
     def tell_all(self) -> None:
         """Tell the neighbours all that is new."""
         if self._nodes:
-            for name, states in self.horizon.news(self._moment(), is_all=True):
-                self.publish(name, states)
+            self._publish(self.horizon.news(self._moment(), is_all=True))
+
+    def _publish(self, news: Iterable[tuple[str, list[KnownState]]]) -> None:
+        for name, states in news:
+            *packets, last = self._leaving.pop(name, ()) or (None,)
+            for link, data in packets:
+                link.publish_with(data, b"")
+            encoded = msgspec.msgpack.encode(states)
+            if last is None or not last[0].publish_with(last[1], encoded):
+                self.publish(name, encoded)
+
+    def _patience_ends_ns(self) -> int | None:
+        return None if self._patience is None else self._patience[0]
+
+    def _lose_patience(self) -> None:
+        if self._patience is not None:
+            is_same, self._patience = self._patience[1] == self._waits_ns, None
+            self.tell(is_patient=not is_same)
 
     def find_awaited(self) -> Sequence[int]:
         """The channels of acknowledgements that could change what the node does."""
@@ -318,6 +364,15 @@ class RosVirtualLoop(VirtualLoop):
 class VirtualSendingLink(SendingLink):
     """One connection at its sender, in virtual time."""
 
+    def __init__(self, *positional: Any) -> None:
+        super().__init__(*positional)
+        self._states = b""
+        # DDS reserves the largest size that a type with bounds can have, and takes no more.
+        *_, publisher = positional
+        leaves = schema(publisher.msg_type).leaves
+        self._has_room = any(leaf.field.is_unbounded for leaf in leaves)
+        self._publish_raw, self.publish = self.publish, self._publish_outermost
+
     def open_in(self, loop: RosVirtualLoop, node_time: NodeTime) -> None:
         """The receiver is there: from now on packets get their times of arrival."""
         self._loop, self._time = loop, node_time
@@ -334,7 +389,21 @@ class VirtualSendingLink(SendingLink):
         way = self._direction.send(self._time.now_ns)
         if way is not None:
             self._loop.horizon.send(_packets(self._connection), way[0])
-            self._publish(data)
+            self._loop.send(self, self._connection.destination_node, data)
+
+    def publish_with(self, data: bytes, states: bytes) -> bool:
+        """Publish a packet; returns whether it carries the states, which no other reader knows."""
+        can_carry = self._has_room and len(states) > 0 and self.count_readers() == 1
+        self._states = states if can_carry else b""
+        self._publish(data)
+        return can_carry
+
+    def _publish_outermost(self, data: bytes) -> None:
+        if self._states:
+            size = len(self._states)
+            head = _STATED.pack(HEADER[:2], _STATED_MARK, size)
+            data = b"".join((head, self._states, b"\0" * (-size % _ALIGNMENT), data))
+        self._publish_raw(data)
 
 
 class VirtualReceivingLink(ReceivingLink):
@@ -406,6 +475,24 @@ class RosVirtualTransport(RosTransport):
         loop.publish = lambda other, states: _publish(publishers[other], states)
         ros.every(ros_node, _TELL_ALL_S, loop.tell_all)
 
+    def _subscribe(
+        self,
+        kind: type,
+        connection: Connection,
+        part: str,
+        qos: QoSProfile,
+        deliver: Callable[[bytes], None],
+    ) -> Subscription:
+        def receive(data: bytes) -> None:
+            if data[2:4] != _STATED_MARK:
+                deliver(data)
+                return
+            end = _STATED.size + _STATED.unpack_from(data)[-1]
+            deliver(data[end + -end % _ALIGNMENT :])
+            self._virtual.learn(_DECODER.decode(data[_STATED.size : end]))
+
+        return super()._subscribe(kind, connection, part, qos, receive)
+
     def _data_qos(self, connection: Connection, *, is_reader: bool = False) -> QoSProfile:
         return _ALL
 
@@ -462,9 +549,8 @@ def _end_of_hold() -> None:
     """An event at the end of a hook: then the neighbours learn that the node is free."""
 
 
-def _publish(publisher: Publisher, states: Sequence[KnownState]) -> None:
-    data = msgspec.msgpack.encode(states)
-    publisher.handle.publish_raw(_ARRAY.pack(HEADER, 0, 0, len(data)) + data)
+def _publish(publisher: Publisher, states: bytes) -> None:
+    publisher.handle.publish_raw(_ARRAY.pack(HEADER, 0, 0, len(states)) + states)
 
 
 def _states_in(data: bytes) -> list[KnownState]:

@@ -94,6 +94,13 @@ class Field:
         """Whether it holds one message."""
         return self.shape is Shape.SINGLE and self.type.sort is Sort.MESSAGE
 
+    @property
+    def is_unbounded(self) -> bool:
+        """Whether it may have any number of values, or of characters."""
+        if self.shape is Shape.SINGLE:
+            return self.type.sort in (Sort.TEXT, Sort.WIDE_TEXT) and self.type.bound is None
+        return self.size is None and self.bound is None
+
 
 @dataclass(frozen=True)
 class Leaf:

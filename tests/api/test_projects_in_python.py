@@ -274,7 +274,7 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "no plugin": (
         lambda: neuros.Project([one(None)]),
-        "neuros.Node('one'): needs exactly one of 'plugin' or 'network'",
+        "neuros.Node('one'): needs exactly one of 'plugin', 'network' or 'policy'",
     ),
     "no hook": (
         lambda: one(undecorated),

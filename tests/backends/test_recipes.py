@@ -191,11 +191,12 @@ class TestDigest:
 class TestOwnRecipes:
     """What lies in ``containers/``."""
 
-    def test_there_are_six(self) -> None:
+    def test_there_are_seven(self) -> None:
         assert names_in(OWN_FOLDER) == [
             "neuros_mujoco",
             "neuros_nest",
             "neuros_nir",
+            "neuros_onnx",
             "neuros_python",
             "neuros_tensorflow",
             "neuros_tools",

@@ -82,7 +82,7 @@ def test_validate_lists_problems_with_their_places(said: Any, tmp_path: Path) ->
     (problem,) = found["problems"]
     assert problem["pointer"] == "/nodes/0"
     assert (problem["line"], problem["column"]) == (1, 12)
-    assert "needs exactly one of 'plugin' or 'network'" in problem["text"]
+    assert "needs exactly one of 'plugin', 'network' or 'policy'" in problem["text"]
 
 
 def test_verify_has_its_verdict(said: Any, tmp_path: Path) -> None:

@@ -116,8 +116,11 @@ def by_one_queue(nodes: list[Behaviour], channels: list[Channel]) -> None:
 class Apart:
     """The same nodes, each with a horizon of its own; messages come in any order of topics."""
 
-    def __init__(self, nodes: list[Behaviour], channels: list[Channel], seed: int) -> None:
+    def __init__(
+        self, nodes: list[Behaviour], channels: list[Channel], seed: int, patience: float = 0.0
+    ) -> None:
         self.nodes, self.channels = nodes, channels
+        self.patience = patience
         self.random = random.Random(seed)
         self.topics: dict[tuple[int, int, str], deque[object]] = {}
         self.last: dict[int, int] = {}
@@ -136,7 +139,7 @@ class Apart:
             ],
         )
 
-    def advance(self, node: Behaviour) -> None:
+    def advance(self, node: Behaviour, *, is_patient: bool) -> None:
         mine = self.horizons[node.name]
         while node.events and not mine.waits_for(node.events[0][0]):
             self.now_ns[node.name] = node.events[0][0]
@@ -151,7 +154,7 @@ class Apart:
         moment = Moment(
             self.now_ns[node.name], node.next_ns, free_ns, waits_ns, mine.causes, zero_ns=0
         )
-        for other, states in mine.news(moment):
+        for other, states in mine.news(moment, is_patient=is_patient):
             self.states_sent += 1
             self.topics[node.name, int(other), "time"] = deque([states])  # the newest counts
 
@@ -160,7 +163,15 @@ class Apart:
 
     def run(self) -> None:
         for node in self.nodes:
-            self.advance(node)
+            self.advance(node, is_patient=False)
+        is_over = False
+        while not is_over:
+            self.deliver_all()
+            for node in self.nodes:  # patience is over
+                self.advance(node, is_patient=False)
+            is_over = not any(self.topics.values())
+
+    def deliver_all(self) -> None:
         while full := [key for key, topic in self.topics.items() if topic]:
             _, target, topic = key = self.random.choice(full)
             what: Any = self.topics[key].popleft()
@@ -170,7 +181,7 @@ class Apart:
             else:
                 node.receive(*what)
                 self.horizons[target].receive(int(topic))
-            self.advance(node)
+            self.advance(node, is_patient=self.random.random() < self.patience)
 
 
 @st.composite
@@ -198,14 +209,14 @@ def made(nodes: list[tuple[int, int]], channels: list[Channel]) -> list[Behaviou
     ]
 
 
-@given(network=networks(), seed=st.integers(0, 2**32))
+@given(network=networks(), seed=st.integers(0, 2**32), patience=st.sampled_from([0.0, 0.5, 1.0]))
 @settings(max_examples=100, deadline=None)
 def test_nodes_apart_handle_the_same_events_as_in_one_queue(
-    network: tuple[list[tuple[int, int]], list[Channel]], seed: int
+    network: tuple[list[tuple[int, int]], list[Channel]], seed: int, patience: float
 ) -> None:
     together = made(*network)
     by_one_queue(together, network[1])
-    apart = Apart(made(*network), network[1], seed)
+    apart = Apart(made(*network), network[1], seed, patience)
     apart.run()
     assert [node.trace for node in apart.nodes] == [node.trace for node in together]
 
@@ -228,6 +239,24 @@ def test_a_source_without_answers_waits_for_a_slow_receiver() -> None:
     assert source.waits_for(time_ns) == "sink"  # received, and not handled
     source.learn([receiver.state(Moment(time_ns, time_ns))])
     assert source.waits_for(time_ns) == ""
+
+
+def test_a_node_that_waits_asks_no_neighbour_whose_messages_all_bring_packets() -> None:
+    names = {0: "talker", 1: "quiet"}
+    talker = Horizon("talker", {}, [horizon.Channel(0, "sink", 10)])
+    quiet = Horizon("quiet", {}, [horizon.Channel(1, "sink", 10)])
+    sink = Horizon("sink", names, [])
+    for time_ns in range(3):
+        talker.send(0, time_ns + 10)
+        sink.learn([talker.state(Moment(time_ns, time_ns + 1, zero_ns=0))])
+        sink.learn([quiet.state(Moment(time_ns, time_ns + 1, zero_ns=0))])
+    assert sink.waits_for(50)
+    moment = Moment(0, 50, -1, 50, sink.causes, zero_ns=0)
+    assert {*dict(sink.news(moment))} == {"talker", "quiet"}  # the first states
+    later = moment._replace(now_ns=1)
+    assert [name for name, _ in sink.news(later, is_patient=True)] == ["quiet"]
+    assert sink.withholds
+    assert "talker" in dict(sink.news(later))  # patience is over
 
 
 def test_messages_with_a_long_delay_are_no_backlog() -> None:

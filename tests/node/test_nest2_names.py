@@ -9,6 +9,7 @@ import pytest
 
 from neuros.errors import HookError, PluginError
 from neuros.node.plugin import FUNCTIONS, MODELS, PARAMETERS, load_plugin, nest2_hint
+from neuros.project.model import Node
 from neuros.snn import reset_kernel
 from neuros.testing import PluginHarness
 
@@ -162,5 +163,5 @@ def test_after_a_plugin_that_imports_nest_libraries_share_no_symbols(tmp_path: P
         "@neuros_initialise()\ndef begin(node): ...\n"
     )
     before = sys.getdlopenflags()
-    load_plugin(plugin, "node")
+    load_plugin(Node("node", "neuros_nest", plugin))
     assert sys.getdlopenflags() == before

@@ -12,9 +12,10 @@ import pytest
 from neuros.api.loading import load_with_messages
 from neuros.backends.docker.back_end import BACK_END as DOCKER
 from neuros.errors import EnvironmentFault, PluginError, ProjectError
+from neuros.node.plugin import load_plugin
 from neuros.project.graph import graph_text
 from neuros.project.load import load_project
-from neuros.project.model import Folders, Project
+from neuros.project.model import Folders, Node, Port, Project
 from neuros.project.paths import find_module, is_module_name
 from neuros.project.split import node_file_from_json, node_file_to_json, project_to_json, split
 from neuros.testing import PluginHarness
@@ -186,3 +187,23 @@ def test_a_container_of_neuros_cannot_have_it(tmp_path: Path) -> None:
         DOCKER.prepare(project, project.nodes, {})
     assert "the plugin of node 'brain' is lab_brains.doubler, and the container" in str(fault.value)
     assert "containers/lab_brains/requirements.txt beside the project file" in str(fault.value)
+
+
+def test_a_module_can_make_its_hooks_from_the_description_of_the_node(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``neuros_hooks``: a plugin for any ports."""
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / "__init__.py").write_text("")
+    file = tmp_path / "lab" / "any_ports.py"
+    file.write_text(
+        "from neuros.hooks import neuros_function\n"
+        "def neuros_hooks(node):\n"
+        "    names = [port.name for port in node.inputs]\n"
+        "    return [neuros_function(inputs=names)(lambda node, *packets: None)]\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    ports = tuple(Port(name, "std_msgs/msg/Empty") for name in ("left", "right"))
+    node = Node("any", "neuros_python", file, inputs=ports, module="lab.any_ports")
+    (spec,) = load_plugin(node)
+    assert [port.name for port in spec.inputs] == ["left", "right"]

@@ -155,4 +155,6 @@ def test_mistakes_come_together_with_those_of_the_files(file: Path) -> None:
 
 def test_removing_what_is_needed_is_reported_at_the_file(file: Path) -> None:
     (problem,) = problems(file, "nodes.robot.plugin=")
-    assert problem.endswith("robot.json:1:1: /: needs exactly one of 'plugin' or 'network'")
+    assert problem.endswith(
+        "robot.json:1:1: /: needs exactly one of 'plugin', 'network' or 'policy'"
+    )

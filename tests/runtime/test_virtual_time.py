@@ -5,11 +5,15 @@ from __future__ import annotations
 import os
 import threading
 import time
+from array import array
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from std_msgs.msg import Float64, String
 
 import neuros
 from neuros.errors import NeurosError, ProjectError, UsageError
@@ -20,6 +24,7 @@ from neuros.hooks import (
     neuros_initialise,
     neuros_tick,
 )
+from neuros.runtime.virtual_ros import VirtualSendingLink
 from neuros.simulators.mujoco import MuJoCo
 from neuros.time import to_nanoseconds
 
@@ -93,6 +98,45 @@ def run(
     with described.session(backend="local") as session:
         session.run(duration_s=seconds)
         log.is_over = True
+
+
+@dataclass
+class Topic:
+    """Stands in for a publisher: what it publishes, and for how many."""
+
+    msg_type: Any
+    readers: int = 1
+    published: list[bytes] = field(default_factory=list)
+
+    @property
+    def handle(self) -> Any:
+        return SimpleNamespace(publish_raw=self.published.append)
+
+    def get_subscription_count(self) -> int:
+        return self.readers
+
+
+@pytest.mark.parametrize(
+    ("topic", "carries"),
+    [
+        (Topic(String), True),
+        (Topic(String, readers=2), False),  # the other reads messages as ROS serialises them
+        (Topic(Float64), False),  # DDS has room for 8 bytes
+    ],
+)
+def test_a_packet_carries_states_of_nodes_if_only_its_receiver_reads_it(
+    topic: Topic, carries: bool
+) -> None:
+    connection: Any = SimpleNamespace(is_jpeg=False)
+    unused: Any = None
+    link = VirtualSendingLink(connection, unused, unused, unused, array("Q"), topic)
+    link._publish = link.publish
+    assert link.publish_with(b"\0\1\0\0packet", b"") is False
+    assert link.publish_with(b"\0\1\0\0packet", b"states") is carries
+    plain, second = topic.published
+    assert plain == b"\0\1\0\0packet"
+    assert second.endswith(plain)
+    assert (b"states" in second) is carries
 
 
 # ---------------------------------------------------------------------- when something happens

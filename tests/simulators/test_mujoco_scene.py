@@ -86,6 +86,26 @@ def test_what_moves_are_joints_mocap_bodies_and_what_hangs_on_them(shown: dict[s
     assert shown["bodies"][names.index("fixed")]["pos"] == [1, 2, 3]
 
 
+def test_a_camera_follows_what_joints_carry_from_so_far_as_that_extends() -> None:
+    carried = geometry(
+        mujoco.MjModel.from_xml_string("""
+        <mujoco><worldbody>
+          <body name="slide_x"><joint type="slide"/>
+            <inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
+            <body name="slide_y"><joint type="slide"/>
+              <inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/>
+              <body name="robot" pos="5 0 1"><geom size="0.5"/>
+                <body pos="2 0 0"><geom size="0.1"/></body>
+              </body>
+            </body>
+          </body>
+        </worldbody></mujoco>""")
+    )
+    (root,) = carried["roots"]
+    assert carried["bodies"][root]["name"] == "robot"
+    assert carried["reaches"] == pytest.approx([2.1])
+
+
 def test_a_mesh_has_the_surface_of_the_model(shown: dict[str, Any]) -> None:
     mesh = shown["meshes"][shown["geoms"][-1]["mesh"]]
     points = array(mesh["position"], "<f4").reshape(-1, 3)[array(mesh["index"], "<u4")]

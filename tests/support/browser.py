@@ -37,4 +37,4 @@ def browser_page(width: int = 1400, height: int = 1100) -> Iterator[Any]:
             yield page
         finally:
             browser.close()
-    assert complaints == []
+    assert complaints == [], complaints

@@ -72,6 +72,8 @@ BY_NAME = {
         "extensions/neuros-learn/tests/test_gym_environments.py",
         "extensions/neuros-learn/tests/test_gym_pictures.py",
         "extensions/neuros-learn/tests/test_gym_vectors.py",
+        "extensions/neuros-learn/tests/test_policies.py::TestTime::test_a_session",
+        "extensions/neuros-learn/tests/test_policies.py::TestRuns",
         "integration/",
         "runtime/test_local_loop.py::test_a_free_run_serves_ros",
         "runtime/test_local_loop.py::test_events_timers_and_threads",

@@ -105,7 +105,7 @@ class SimulatedNode:
         self.read_time_s: Callable[[], float] = lambda: -1.0
         self.ends_at_s = float("inf")
         self.look_at_world: WorldLook | None = None
-        self.is_driving = False
+        self.is_driving = self.is_ending = False
         self.advance: Advance | None = None
 
     def make_packet(self, output: str) -> Any:

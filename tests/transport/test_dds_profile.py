@@ -110,6 +110,12 @@ def test_nothing_but_this_machine_is_reached_and_all_of_a_domain() -> None:
     assert reach.text == str(MOST_LOCAL_PARTICIPANTS)
 
 
+def test_the_send_buffer_holds_the_announcements_of_a_crowd() -> None:
+    """With Linux's default, writers of a crowd ask for acknowledgements with each announcement."""
+    (size,) = ElementTree.parse(LOCAL_PROFILES).iter(f"{NAMESPACE}sendBufferSize")
+    assert int(size.text or 0) >= 4 << 20
+
+
 def test_both_files_are_packaged() -> None:
     for file in (PROFILES, LOCAL_PROFILES):
         assert file.suffix == ".xml"

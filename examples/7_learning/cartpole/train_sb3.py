@@ -1,10 +1,11 @@
-"""Learns to balance the pole with Stable-Baselines3: python train_sb3.py [network.npz]
+"""Learns to balance the pole with Stable-Baselines3: python train_sb3.py [balance.onnx]
 
-Proximal policy optimization with a network of 16 units. What it has learnt is written for
-policy.py, which needs neither Stable-Baselines3 nor PyTorch. J. Schulman et al., "Proximal Policy
-Optimization Algorithms", 2017.
+Proximal policy optimization with a network of 16 units. What it has learnt is written to
+network.npz for policy.py, or in ONNX for a node without a plugin; neither needs Stable-Baselines3
+or PyTorch. J. Schulman et al., "Proximal Policy Optimization Algorithms", 2017.
 """
 
+import json
 import sys
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from train import HERE, STEPS, make
+
+import neuros.gym
 
 MOST_STEPS, BETWEEN, EPISODES = 40_960, 4_096, 3
 
@@ -47,7 +50,11 @@ def learn(env, seed=1):
 
 
 def write(file, model):
-    """The layers from observation to force, as policy.py reads them."""
+    """The policy in ONNX, or the layers from observation to force, as policy.py reads them."""
+    if file.suffix == ".onnx":
+        node = neuros.gym.export_policy(model, file)
+        print(json.dumps(node, indent=4))  # as in exported.json
+        return
     layers = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
     arrays = {}
     for n, layer in enumerate(each for each in layers if isinstance(each, torch.nn.Linear)):

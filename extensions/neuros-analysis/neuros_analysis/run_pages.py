@@ -304,6 +304,7 @@ def _panels(name: str, topic: RecordedTopic, start_ns: int) -> Iterator[dict[str
                 "output": name,
                 "kind": "array",
                 "field": ARRAYS[topic.type],
+                "clock": "simulated" if has_simulated_time(columns) else "wall clock",
                 "size": rows[0].size,
                 "span": [float(times.min()), float(times.max())],
                 "times": _packed(times.astype("<f8")),

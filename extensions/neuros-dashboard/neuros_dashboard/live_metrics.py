@@ -18,7 +18,6 @@ from neuros.control import (
     WORLD,
     Ended,
     GetStatus,
-    LogRecord,
     Message,
     NodeStatus,
     PhaseChanged,
@@ -184,12 +183,14 @@ class LiveMetrics:
     Attributes:
         nodes, connections: by name, ready for JSON.
         sim_time: simulated seconds, ``None`` without a node that owns time.
+        virtual_s: of a run in virtual time, the latest time of a node.
     """
 
     def __init__(self) -> None:
         self.nodes: dict[str, dict[str, Any]] = {}
         self.connections: dict[str, dict[str, Any]] = {}
         self.sim_time: float | None = None
+        self.virtual_s = 0.0
         self._speeds: dict[tuple[str, str], Speed] = {}
         self._latencies: dict[str, Latency] = {}
         self._losses: dict[str, Loss] = {}
@@ -210,6 +211,7 @@ class LiveMetrics:
             self.nodes[status.node] = {"state": "loading", "cause": ""}
             return
         now_s, metrics = counters.now_s, counters.metrics
+        self.virtual_s = max(self.virtual_s, now_s)
         if status.sim_time is not None:
             self.sim_time = status.sim_time
             self._speed("sim", "", now_s, status.sim_time)
@@ -419,8 +421,6 @@ class ObservedRun:
             case PhaseChanged():
                 self.phase = {"phase": message.phase, "is_paused": message.is_paused}
                 self._pages.send("phase", self.phase)
-            case LogRecord(severity, text):
-                self._pages.send("log", [f"[{severity}] [neuros] {text}"])
             case Ended(exit_code, reason, reports, running_s, real_time_factor, has_drained):
                 self._metrics.end(reports, running_s, real_time_factor, has_drained)
                 self._show()
@@ -437,6 +437,7 @@ class ObservedRun:
                 "nodes": metrics.nodes,
                 "connections": metrics.connections,
                 "sim_time": metrics.sim_time,
+                "virtual_s": metrics.virtual_s,
                 "real_time_factor": metrics.real_time_factor,
             },
         )

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from typing import Any
 from urllib.parse import quote, urlsplit
 
+from neuros.api.run_folder import LAUNCHER_LOG
 from neuros.backends.sidecars import start_sidecar
 from neuros.distribution import install_command, python_command
 from neuros.errors import EnvironmentFault, UsageError
@@ -21,6 +22,7 @@ from neuros.project.dashboard import ARRAYS, IMAGES, SPIKES
 from neuros.project.graph import guarantee
 from neuros.project.model import Node, Port, Project
 from neuros.project.names import Names
+from neuros.recording.system_load import LAUNCHER
 from neuros_dashboard.viewer import Viewer
 from neuros_dashboard.windows import end_process, open_page
 
@@ -77,7 +79,8 @@ class _DashboardView:
                 "run": run.run_id,
                 "plan": project_view(run.project, run.names),
                 "names": run.names,
-                "logs": {name: str(path) for name, path in run.logs.items()},
+                "logs": {name: str(path) for name, path in run.logs.items()}
+                | {LAUNCHER: str(run.folder / LAUNCHER_LOG)},
                 "is_one_process": run.is_one_process,
                 "start_s": time.monotonic(),
                 "token": self._token,
@@ -197,6 +200,7 @@ def project_view(project: Project, names: Sequence[str]) -> dict[str, Any]:
     """
     return {
         "project": project.name,
+        "is_virtual": project.is_virtual,
         "dashboard": project.dashboard,
         "nodes": [
             {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import signal
 import socket
@@ -121,6 +122,73 @@ def test_a_visitor_sees_and_steers_a_run_in_a_browser(tmp_path: Path) -> None:
     assert re.search(rf"^world +{shares.replace(' ', '')} ", finished.output, re.M)
     assert finished.connection(IMU)["lost"] == 0
     assert finished.record["nodes"]["world"]["accounting"]["paused"] > 0
+
+
+PAIR = """
+from neuros.hooks import neuros_function, neuros_tick
+
+@neuros_tick(seconds=0.05, outputs="pair")
+def beat(node):
+    packet = node.make_packet("pair")
+    packet.data = [1.0, 2.0]
+    return packet
+
+@neuros_function(inputs="camera")
+def see(node, camera):
+    pass
+"""
+
+
+def test_a_narrow_dark_page_is_usable_and_says_what_has_not_come_yet(tmp_path: Path) -> None:
+    (tmp_path / "eye.py").write_text(PAIR)
+    ends = [
+        ("inputs", "camera", "sensor_msgs/msg/Image"),
+        ("outputs", "pair", "std_msgs/msg/Float64MultiArray"),
+    ]
+    ports = {
+        way: [{"name": name, "type": kind, "external_topic": name}] for way, name, kind in ends
+    }
+    node = {"name": "eye", "container": "neuros_python", "plugin": "eye.py", **ports}
+    (tmp_path / "project.json").write_text(json.dumps({"nodes": [node]}))
+    with start(tmp_path, "--dashboard", cwd=tmp_path) as running, browser_page(390, 844) as page:
+        page.emulate_media(color_scheme="dark")
+        page.goto(address(running))
+        page.wait_for_selector('#nodes tr[data-name="eye"] .waiting')
+        assert page.evaluate("() => document.documentElement.scrollWidth") == 390
+        for button in ("#pause", "#step", "#stop", "#layout", "#theme"):
+            box = page.locator(button).bounding_box()
+            assert 0 <= box["x"] <= 390 - box["width"], button
+        assert page.inner_text("#images .none") == "no picture yet"
+        assert not page.is_visible("#images img")
+
+        # Two numbers are plotted; they make no heat map, and no bump.
+        page.click('#connections tr[data-name="eye.pair -> pair"]')
+        page.wait_for_selector('#details tr[data-name="data[1]"] button')
+        assert not page.is_visible('button:text("heat map")')
+
+        # What the launcher has said since the start, but for the address with its token.
+        wait_until(page, "() => document.querySelector('#log').textContent.includes('run folder')")
+        assert "token" not in page.inner_text("#log")
+        assert re.search(r"wall clock \d+ s", page.inner_text("#times"))
+
+        # Dark as the system has it, until the user wants it otherwise in this browser.
+        colours = "() => getComputedStyle(document.body).backgroundColor"
+        dark = page.evaluate(colours)
+        page.click("#theme")
+        light = page.evaluate(colours)
+        assert sum(map(int, re.findall(r"\d+", light))) > sum(map(int, re.findall(r"\d+", dark)))
+        page.reload()
+        page.wait_for_selector("#phase.running")
+        assert page.evaluate(colours) == light
+        page.click("#theme")
+        assert page.evaluate(colours) == dark
+        assert Visitor(address(running)).post("/do/stop") == 204
+        finished = running.finish()
+    assert finished.exit_code == 0
+    assert finished.run_folder is not None
+    log = (finished.run_folder / "launcher.log").read_text()
+    assert "run folder" in log
+    assert "token" not in log
 
 
 def test_nobody_gets_in_without_the_token_or_from_another_page(tmp_path: Path) -> None:

@@ -14,9 +14,6 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
-from functools import reduce
-from math import prod
 from pathlib import Path
 from typing import Any, SupportsFloat
 
@@ -30,9 +27,9 @@ from neuros.project.model import SEEDS, Port
 from neuros.project.model import Project as Described
 from neuros.project.suggest import did_you_mean
 from neuros.project.timing import seeds
-from neuros.transport.messages import factory_of, message_class
-from neuros.transport.schema import NUMBERS, Leaf, Shape, Sort, getter, schema
 from neuros.visualise import image_pixels
+from neuros_learn.numbers import Numbers, numbers_of, shape_of
+from neuros_learn.policies.export import export
 
 try:
     import gymnasium
@@ -46,7 +43,6 @@ except ModuleNotFoundError as error:
     ) from error
 
 _NAME = re.compile(r"(?P<port>\w+\.\w+)(?P<field>(\.\w+)*)(\[(?P<shape>\d+(, *\d+)*)\])?")
-_STAMPS = ("Time", "Duration")
 _MOST_ROUNDS = 100
 """Within this number of rounds after a reset each observed output must send."""
 _SEEDS = 2**31
@@ -153,15 +149,52 @@ def register(
     )
 
 
+def export_policy(model: Any, file: str | os.PathLike[str], env: Any = None) -> dict[str, Any]:
+    """Write a policy that was trained in an environment of a project, in ONNX.
+
+    The file holds all between packets and packets: the normalisation of observations by
+    ``VecNormalize``, the network without noise, and the limits of the action space. Source of the
+    format: https://onnx.ai.
+
+    Args:
+        model: an algorithm of Stable-Baselines3, or a ``torch.nn.Module`` that maps observations,
+            float32 ``(batch, n)``, to actions ``(batch, m)``; those of several names are joined in
+            the order of the observation space.
+        file: ``"walk.onnx"``.
+        env: the environment; ``None``: that of the algorithm.
+
+    Returns:
+        The node that runs the policy, ready for a project file: ports, and parameters that say
+        which numbers are observed.
+
+    Raises:
+        UsageError: the environment is none of a project, or one of its wrappers changes
+            observations.
+        EnvironmentFault: PyTorch is not installed.
+    """
+    if env is None and hasattr(model, "get_env") and model.get_env() is not None:
+        env = model.get_env().get_attr("unwrapped")[0]
+    world = getattr(env, "unwrapped", None)
+    if not isinstance(world, _World):
+        raise UsageError(
+            "export_policy: give the environment of neuros.gym.make that the policy was trained in"
+        )
+    return export(model, file, world)
+
+
 class _World:
     """A project that an environment steps: its session, and its actions and observations by name.
 
     Attributes:
         session: the run.
+        described: the project.
+        action_signals, observation_signals: the numbers of each name.
         action, observation: those of the last step.
     """
 
     session: Session
+    action_signals: list[_Signal]
+    observation_signals: list[_Signal]
 
     def _open(
         self,
@@ -189,6 +222,7 @@ class _World:
             also_taken: further inputs to take over.
         """
         self._functions = {name: _by_names(name, each) for name, each in functions.items()}
+        self.described = described
         self._rounds, self._sim_s = length
         self._initial_action = initial_action
         self._has_seeds = bool(seeds(described.nodes))
@@ -200,15 +234,14 @@ class _World:
             """Find the numbers of all actions and observations."""
             controls = {} if model is None else _controls(described, project.file.parent / model)
             given = ranges or {}
-            self._actions = [
-                _numbers(described, name, given, controls, copies=copies)
-                for name in _listed(action)
+            self.action_signals = [
+                _signal(described, name, given, controls, copies=copies) for name in _listed(action)
             ]
-            self._observations = [
-                _numbers(described, name, given, is_output=True, copies=copies)
+            self.observation_signals = [
+                _signal(described, name, given, is_output=True, copies=copies)
                 for name in _listed(observation)
             ]
-            names = [each.name for each in (*self._actions, *self._observations)]
+            names = [each.name for each in (*self.action_signals, *self.observation_signals)]
             if unknown := given.keys() - {*names}:
                 raise UsageError(f"ranges: '{min(unknown)}' is none of {', '.join(names)}")
 
@@ -221,7 +254,7 @@ class _World:
         except BaseException:
             self.session.close()
             raise
-        self._outputs = {each.port: self.session[each.port] for each in self._observations}
+        self._outputs = {each.port: self.session[each.port] for each in self.observation_signals}
         self._has_one_action = isinstance(action, str)
         self._has_one_observation = isinstance(observation, str)
         self.action: Any = None
@@ -255,7 +288,7 @@ class _World:
         return goes_on, self._seen(before)
 
     def _send(self, action: Any) -> None:
-        for each in self._actions:
+        for each in self.action_signals:
             message = each.message(action if self._has_one_action else action[each.name])
             for end in each.inputs:
                 self.session.send(end, message)
@@ -263,10 +296,10 @@ class _World:
     def _observe(self) -> Any:
         outputs = self._outputs
         if self._has_one_observation:
-            each = self._observations[0]
+            each = self.observation_signals[0]
             return each.read(outputs[each.port].shared_packet)
         packets = {name: output.shared_packet for name, output in outputs.items()}
-        return {each.name: each.read(packets[each.port]) for each in self._observations}
+        return {each.name: each.read(packets[each.port]) for each in self.observation_signals}
 
     def _seen(self, before: Any) -> dict[str, Any]:
         """What the user's functions are given, by :data:`_SEEN`."""
@@ -370,8 +403,8 @@ class ProjectEnv(_World, gymnasium.Env[Any, Any]):
             options={"backend": backend, **options},
             model=model,
         )
-        self.action_space = _space(self._actions, is_one=self._has_one_action)
-        self.observation_space = _space(self._observations, is_one=self._has_one_observation)
+        self.action_space = _space(self.action_signals, is_one=self._has_one_action)
+        self.observation_space = _space(self.observation_signals, is_one=self._has_one_observation)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -509,8 +542,10 @@ class ProjectVectorEnv(_World, gymnasium.vector.VectorEnv[Any, Any, Any]):
             also_taken=self._masked,
         )
         self.metadata = {"render_modes": [], "autoreset_mode": AutoresetMode.NEXT_STEP}
-        self.single_action_space = _space(self._actions, is_one=self._has_one_action)
-        self.single_observation_space = _space(self._observations, is_one=self._has_one_observation)
+        self.single_action_space = _space(self.action_signals, is_one=self._has_one_action)
+        self.single_observation_space = _space(
+            self.observation_signals, is_one=self._has_one_observation
+        )
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self._most_steps = max_episode_steps
@@ -643,7 +678,7 @@ def _with_copies(
     return loaded, [*found]
 
 
-def _numbers(
+def _signal(
     project: Described,
     written: str,
     ranges: Mapping[str, tuple[Any, Any]],
@@ -651,184 +686,56 @@ def _numbers(
     *,
     is_output: bool = False,
     copies: int | None = None,
-) -> _Numbers:
+) -> _Signal:
     """The numbers of a name; ``ranges`` are by name, ``controls`` by input."""
-    port = _port(project, _split(written)[0], is_output=is_output)
-    if copies is not None:
-        if port.array is None or port.array.shape[0] != copies or len(port.array.shape) < 2:
-            raise UsageError(
-                f"'{written}': a port of {copies} copies has arrays of all, with a leading axis,"
-                f' not {port.type}: give its node the key "copies"'
-            )
-        port = replace(port, type=str(port.array.of_one_copy))
-    inputs = [] if is_output else _inputs_behind(project, _split(written)[0])
-    driven = controls.get(inputs[0]) if inputs else None
-    if copies is not None:
-        return _BatchNumbers(port, written, inputs, ranges, copies)
-    return (_ArrayNumbers if port.array else _Numbers)(port, written, inputs, ranges, driven)
+    name, field, shape = _split(written)
+    port = _port(project, name, is_output=is_output)
+    if copies is not None and (port.array is None or port.array.shape[0] != copies):
+        raise UsageError(
+            f"'{written}': a port of {copies} copies has arrays of all, with a leading axis,"
+            f' not {port.type}: give its node the key "copies"'
+        )
+    numbers = numbers_of(port, name, field, shape, copies)
+    inputs = [] if is_output else _inputs_behind(project, name)
+    driven = controls.get(inputs[0]) if inputs and copies is None else None
+    return _Signal(
+        written, numbers, inputs, ranges.get(numbers.name, (0, 1) if numbers.is_bool else driven)
+    )
 
 
-class _Numbers:
-    """Numbers of the messages of a port, as one array.
+class _Signal:
+    """Numbers of a port, as an action or an observation.
 
     Attributes:
-        name: the user's name without brackets.
-        port: ``node.port``.
+        written: the name as the user gave it.
+        numbers: their place in packets; name, port: as there.
         inputs: of an action: the input, or those that the output feeds.
-    """
-
-    def __init__(
-        self,
-        port: Port,
-        written: str,
-        inputs: Sequence[str],
-        ranges: Mapping[str, tuple[Any, Any]],
-        driven: tuple[Any, Any] | None,
-    ) -> None:
-        self.port, field, shape = _split(written)
-        self.name = self.port + field
-        self.inputs = inputs
-        is_bool = self._resolve(port, written, field, shape)
-        self.space = self._space(ranges.get(self.name, (0, 1) if is_bool else driven))
-
-    def _resolve(self, port: Port, written: str, field: str, shape: tuple[int, ...] | None) -> bool:
-        """Find the numbers, their type and their shape; whether all are truth values."""
-        kind, self._make = message_class(port.type), factory_of(port.type)
-        leaves = _numbers_of(kind, field)
-        if not leaves:
-            known = ", ".join(f"{self.port}.{_path(leaf)}" for leaf in _numbers_of(kind, ""))
-            raise UsageError(f"'{written}': there are no numbers of that name; there are {known}")
-        # The size of a sequence without a bound is None.
-        sizes = [1 if leaf.field.shape is Shape.SINGLE else leaf.field.size for leaf in leaves]
-        free = [_path(leaf) for leaf, size in zip(leaves, sizes, strict=True) if size is None]
-        if len(free) > 1 or (free and shape is None):
-            raise UsageError(
-                f"'{written}': the length of {self.port}.{free[0]} is not known: name that alone,"
-                f" with its shape: '{self.port}.{free[0]}[3]'"
-            )
-        fixed = sum(size or 0 for size in sizes)
-        count = fixed if shape is None else prod(shape)
-        self._sizes = [count - fixed if size is None else size for size in sizes]
-        if sum(self._sizes) != count or min(self._sizes) < 0:
-            raise UsageError(f"'{written}': its messages have {fixed} numbers, not {count}")
-        self._leaves, self._shape = leaves, (count,) if shape is None else shape
-        self._get = getter([leaf.path for leaf in leaves])
-        self._is_flat = all(leaf.field.shape is Shape.SINGLE for leaf in leaves)
-        is_bool = all(leaf.field.type.sort is Sort.BOOL for leaf in leaves)
-        self._dtype = np.dtype(np.uint8) if is_bool else np.result_type(*map(_dtype, leaves))
-        return is_bool
-
-    def _space(self, bounds: tuple[Any, Any] | None) -> spaces.Box:
-        if bounds is None:
-            is_float = self._dtype.kind == "f"
-            info = None if is_float else np.iinfo(self._dtype)
-            bounds = _UNBOUNDED if info is None else (info.min, info.max)
-        try:
-            low, high = (
-                np.broadcast_to(np.asarray(bound, self._dtype), self._shape) for bound in bounds
-            )
-        except (ValueError, TypeError, OverflowError) as error:
-            raise UsageError(f"range of {self.name}: {error}") from error
-        if not np.all(low <= high):  # false for NaN, too
-            raise UsageError(f"range of {self.name}: the lowest value must be at most the highest")
-        return spaces.Box(low, high, dtype=self._dtype.type)
-
-    def read(self, message: Any) -> Any:
-        """The numbers of a message; raises ``UsageError`` if their number is another one."""
-        values = self._get(message)
-        if self._is_flat:
-            return np.array(values, self._dtype).reshape(self._shape)
-        parts = [np.array(value, self._dtype).reshape(-1) for value in values]
-        for leaf, part, size in zip(self._leaves, parts, self._sizes, strict=True):
-            if part.size != size:
-                raise UsageError(
-                    f"{self.port}.{_path(leaf)} holds {part.size} numbers, not {size}: say so in"
-                    " brackets"
-                )
-        return (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(self._shape)
-
-    def message(self, values: Any) -> Any:
-        """A message with these numbers."""
-        flat, message, start = np.asarray(values).reshape(-1), self._make(), 0
-        if flat.size != sum(self._sizes):
-            raise UsageError(f"{self.name} takes {sum(self._sizes)} numbers, not {flat.size}")
-        for leaf, size in zip(self._leaves, self._sizes, strict=True):
-            numbers = _CONVERT[leaf.field.type.sort](flat[start : start + size])
-            owner = reduce(getattr, leaf.path[:-1], message)
-            is_one = leaf.field.shape is Shape.SINGLE
-            setattr(owner, leaf.path[-1][1:], numbers[0] if is_one else numbers)
-            start += size
-        return message
-
-
-class _ArrayNumbers(_Numbers):
-    """The numbers of a port of arrays."""
-
-    def _resolve(self, port: Port, written: str, field: str, shape: tuple[int, ...] | None) -> bool:
-        array = port.array
-        assert array is not None
-        if field:
-            raise UsageError(
-                f"'{written}': {self.port} is a {array}, without fields: leave them out"
-            )
-        if shape is not None and prod(shape) != array.size:
-            raise UsageError(
-                f"'{written}': its arrays have {array.size} numbers, not {prod(shape)}"
-            )
-        self._array, self._size, self._shape = array, array.size, shape or array.shape
-        is_bool = array.dtype == "bool"
-        self._dtype = np.dtype(np.uint8 if is_bool else array.dtype)
-        return is_bool
-
-    def read(self, message: Any) -> Any:
-        """The numbers of an array."""
-        return message.astype(self._dtype).reshape(self._shape)
-
-    def message(self, values: Any) -> Any:
-        """An array of these numbers; raises ``ValueError`` for one that does not fit."""
-        given, is_float = np.asarray(values), self._dtype.kind == "f"
-        if given.size != self._size:
-            raise UsageError(f"{self.name} takes {self._size} numbers, not {given.size}")
-        given = given.reshape(self._array.shape)
-        if given.dtype == self._array.dtype:
-            return given
-        if given.dtype.kind == "f" and not is_float:
-            given = np.rint(given)
-        with np.errstate(over="ignore", invalid="ignore"):
-            made = given.astype(self._array.dtype)
-        pair = (np.isfinite(made), np.isfinite(given)) if is_float else (made, given)
-        if not np.array_equal(*pair):
-            raise ValueError(f"{self.name}: {values} does not fit in {self._array}")
-        return made
-
-
-class _BatchNumbers(_ArrayNumbers):
-    """The numbers of a port of arrays whose first axis is that of copies.
-
-    Attributes:
         space: of one copy.
     """
 
     def __init__(
         self,
-        port: Port,
         written: str,
+        numbers: Numbers,
         inputs: Sequence[str],
-        ranges: Mapping[str, tuple[Any, Any]],
-        copies: int,
+        bounds: tuple[Any, Any] | None,
     ) -> None:
-        super().__init__(port, written, inputs, ranges, None)
-        self._shape = (copies, *self._shape)
-        self._array = self._array.of_copies(copies)
-        self._size = self._array.size
-
-
-_CONVERT: Mapping[Sort, Callable[[Any], list[Any]]] = {
-    Sort.BOOL: lambda numbers: numbers.astype(bool).tolist(),
-    Sort.INTEGER: lambda numbers: [round(number) for number in numbers.tolist()],
-    Sort.FLOAT: lambda numbers: numbers.astype(float).tolist(),
-}
-"""Converters from an array of numbers to values of a field."""
+        self.written, self.numbers, self.inputs = written, numbers, inputs
+        self.name, self.port = numbers.name, numbers.port
+        self.read, self.message = numbers.read, numbers.message
+        dtype = numbers.dtype
+        if bounds is None:
+            info = None if dtype.kind == "f" else np.iinfo(dtype)
+            bounds = _UNBOUNDED if info is None else (info.min, info.max)
+        try:
+            low, high = (
+                np.broadcast_to(np.asarray(bound, dtype), numbers.shape) for bound in bounds
+            )
+        except (ValueError, TypeError, OverflowError) as error:
+            raise UsageError(f"range of {self.name}: {error}") from error
+        if not np.all(low <= high):  # false for NaN, too
+            raise UsageError(f"range of {self.name}: the lowest value must be at most the highest")
+        self.space = spaces.Box(low, high, dtype=dtype.type)
 
 
 def _check_steps(number: Any) -> None:
@@ -953,8 +860,8 @@ def _listed(names: str | Sequence[str]) -> Sequence[str]:
     return listed
 
 
-def _space(numbers: Sequence[_Numbers], *, is_one: bool) -> spaces.Space[Any]:
-    return numbers[0].space if is_one else spaces.Dict({each.name: each.space for each in numbers})
+def _space(signals: Sequence[_Signal], *, is_one: bool) -> spaces.Space[Any]:
+    return signals[0].space if is_one else spaces.Dict({each.name: each.space for each in signals})
 
 
 def _split(written: str) -> tuple[str, str, tuple[int, ...] | None]:
@@ -962,8 +869,7 @@ def _split(written: str) -> tuple[str, str, tuple[int, ...] | None]:
     match = _NAME.fullmatch(written)
     if match is None:
         raise UsageError(f"'{written}': say node.port, node.port.field or node.port.field[3]")
-    shape = tuple(map(int, match["shape"].split(","))) if match["shape"] else None
-    return match["port"], match["field"], shape
+    return match["port"], match["field"], shape_of(match["shape"])
 
 
 def _port(project: Described, name: str, *, is_output: bool = False) -> Port:
@@ -1013,23 +919,3 @@ def _controls(project: Described, model: Path) -> dict[str, tuple[Any, Any]]:
                 low, high = limits[chosen].T
                 found[f"{node.name}.{port.name}"] = low, high
     return found
-
-
-def _numbers_of(kind: type, field: str) -> list[Leaf]:
-    """The numeric fields; those of time stamps only if they are named."""
-    known, path = schema(kind), tuple(f"_{part}" for part in field.split(".")[1:])
-    return [
-        leaf
-        for leaf in known.leaves
-        if leaf.path[: len(path)] == path
-        and leaf.field.type.sort in (*NUMBERS, Sort.BOOL)
-        and (path or known.kinds[leaf.owner].__name__ not in _STAMPS)
-    ]
-
-
-def _path(leaf: Leaf) -> str:
-    return ".".join(slot[1:] for slot in leaf.path)
-
-
-def _dtype(leaf: Leaf) -> np.dtype[Any]:
-    return np.dtype(leaf.field.type.code)

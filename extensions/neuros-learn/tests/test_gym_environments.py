@@ -540,6 +540,9 @@ def test_stable_baselines3_trains_it_in_two_minutes_and_the_node_acts_as_its_mod
     finally:
         env.close()
     train_sb3.write(made / "network.npz", model)
+    train_sb3.write(made / "balance.onnx", model)
+    exported = neuros.Project.from_file(made / "exported.json")
+    exported.run(backend="in-process", duration="1sim", output=tmp_path / "exported").check()
     layers = policy.read(made / "network.npz")
     for seen in np.random.default_rng(1).normal(0.0, 0.3, (100, 4)):
         force = policy.push(layers, seen[:2], seen[2:])

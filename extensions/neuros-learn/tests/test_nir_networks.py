@@ -480,7 +480,7 @@ class TestProject:
 
     def test_a_plugin_beside_it_is_one_too_many(self, project: Path) -> None:
         (told,) = self.problems(project, "nodes.brain.plugin=json.decoder")
-        assert told == "/nodes/0: needs exactly one of 'plugin' or 'network'"
+        assert told == "/nodes/0: needs exactly one of 'plugin', 'network' or 'policy'"
 
     def test_one_that_names_no_exporter_is_warned_of(self, project: Path) -> None:
         (warning,) = load_with_messages(project, ["nodes.brain.parameters.exporter="])[0].warnings

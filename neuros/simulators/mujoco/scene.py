@@ -151,24 +151,27 @@ def geometry(model: Any) -> dict[str, Any]:
     """The drawn parts of a model, ready for JSON; lengths in metres, quaternions as w, x, y, z.
 
     ``bodies`` have the pose of the initial state. ``moving`` are the bodies with a row in each
-    frame, in its order, before ``moving_cameras``; ``roots`` are the moving bodies on fixed
-    parents, those with joints first. Geoms, sites, lights and cameras are relative to their body.
+    frame, in its order, before ``moving_cameras``; ``roots`` are what a camera may follow, the
+    moving bodies on fixed parents, those with joints first, and ``reaches`` how far each extends
+    with its children. Geoms, sites, lights and cameras are relative to their body.
     Geoms of groups that MuJoCo's viewer hides, skins, flexes and tendons are left out.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     moving, visual, headlight = _Moving(model), model.vis, model.vis.headlight
     meshes = _Meshes(model)
+    roots = sorted(
+        (body for body in moving.bodies if model.body_parentid[body] not in moving.bodies),
+        key=lambda body: model.body_mocapid[body] >= 0,
+    )
     return {
         "bodies": [
             {"name": model.body(body).name, **_pose(data.xpos[body], data.xquat[body])}
             for body in range(model.nbody)
         ],
         "moving": moving.bodies,
-        "roots": sorted(
-            (body for body in moving.bodies if model.body_parentid[body] not in moving.bodies),
-            key=lambda body: model.body_mocapid[body] >= 0,
-        ),
+        "roots": [_seen(model, body) for body in roots],
+        "reaches": [_reach(model, data, _seen(model, body)) for body in roots],
         "moving_cameras": moving.cameras,
         "geoms": list(_geoms(model, meshes)),
         "sites": [
@@ -212,6 +215,26 @@ def geometry(model: Any) -> dict[str, Any]:
             "diffuse": headlight.diffuse.tolist() if headlight.active else [0, 0, 0],
         },
     }
+
+
+def _seen(model: Any, body: int) -> int:
+    """The body, or below bodies that have nothing but a joint and a child, what they carry."""
+    while not model.body_geomnum[body]:
+        children = np.flatnonzero(model.body_parentid == body)
+        if len(children) != 1:
+            break
+        body = int(children[0])
+    return body
+
+
+def _reach(model: Any, data: Any, root: int) -> float:
+    """How far the geoms of a body and of its children are from its position, in metres."""
+    is_part = np.arange(model.nbody) == root
+    for body in range(root + 1, model.nbody):  # parents come first
+        is_part[body] |= is_part[model.body_parentid[body]]
+    geoms = is_part[model.geom_bodyid] & (model.geom_group <= _MOST_GROUP)
+    away = np.linalg.norm(data.geom_xpos[geoms] - data.xpos[root], axis=1)
+    return float(max(away + model.geom_rbound[geoms], default=0.0))
 
 
 def _geoms(model: Any, meshes: _Meshes) -> Iterator[dict[str, Any]]:

@@ -73,7 +73,7 @@ class MuJoCo:
                 toggle=self._toggle_pause,
                 closed=self.resume,
             )
-        self._is_over = False
+        self._is_over = self._is_shared = False
         world = self._world
         node.own_simulated_time(lambda: world.time.seconds(world.steps))
         node.show_world(self._view.observe)
@@ -131,10 +131,11 @@ class MuJoCo:
         world = self._world
         self._refuse_while_running("step_synchronous")
         world.require_bound()
-        # While the plugin waits here, only the user can resume, in the viewer.
-        if self._lock.is_paused and (self._viewer is None or not self._viewer.is_open):
+        # While the plugin waits here, only others can resume: in the viewer, or from a thread.
+        has_viewer = self._viewer is not None and self._viewer.is_open
+        if self._lock.is_paused and not (has_viewer or self._is_shared):
             raise ModelError("the simulation is paused: resume() it before it is stepped")
-        while not self._is_over and self._lock.is_paused:
+        while not self._is_over and self._lock.is_paused and not self._is_shared:
             self._sync_viewer()
             self._lock.wait_resumed(_IDLE_S)
         if crossing := world.schedule.find_crossing(self._unread, world.steps, target):
@@ -147,7 +148,25 @@ class MuJoCo:
             )
         if self._node.virtual_time is not None:
             self._node.virtual_time.will_step_to(world.time.seconds(target))
-        self._advance_to(target)
+        if self._is_shared:
+            self._advance_shared(target)
+        else:
+            self._advance_to(target)
+
+    def _advance_shared(self, target: int) -> None:
+        """Step as far as a pause allows, and wait for more; other threads may visit meanwhile."""
+        while self._world.steps < target:
+            if not self._lock.enter(lambda: self._is_over or self._node.is_ending, _IDLE_S):
+                if self._is_over or self._node.is_ending:  # nobody resumes it any more
+                    self._lock.resume()
+                    self._advance_to(target)
+                self._sync_viewer()
+                continue
+            try:
+                steps = self._world.steps
+                self._advance_to(steps + self._lock.allowed(target - steps))
+            finally:
+                self._lock.leave()
 
     def read(self, output: str) -> Packet | None:
         """The packet of the sensor behind ``output`` that has come due since the last read."""
@@ -217,6 +236,26 @@ class MuJoCo:
         if self._run is not None:
             self._run.pacer.restart()
         self._lock.resume()
+
+    def share(self) -> None:
+        """From now on, other threads may use it, too, inside ``with sim.paused():``.
+
+        A pause then lets the hook that steps it wait, until :meth:`resume` or :meth:`step_paused`.
+        """
+        self._is_shared = True
+
+    def step_paused(self, count: int, cancelled: Callable[[], bool]) -> int:
+        """In a pause, let whatever steps it make ``count`` timesteps; call it in another thread.
+
+        Returns:
+            How many were not made, since ``cancelled()`` or the end of the pause came first.
+        """
+        return self._lock.grant(count, cancelled)
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether no step begins but those of :meth:`step_paused`."""
+        return self._lock.is_paused
 
     # ---- acting on it -----------------------------------------------------------------------
 
@@ -296,7 +335,7 @@ class MuJoCo:
         if not self._unread:  # packets that the plugin has not read are sent first
             world = self._world
             firing = world.schedule.next_firing(world.steps)
-            target = world.steps + steps
+            target = world.steps + self._lock.allowed(steps)
             self._advance_to(target if firing is None else min(firing, target))
         due, self._unread = self._unread, {}
         return due
@@ -304,6 +343,7 @@ class MuJoCo:
     def _advance_to(self, target: int) -> None:
         world, view = self._world, self._view
         view.is_stepping = True
+        before = world.steps
         while world.steps < target:
             firing = world.schedule.next_firing(world.steps)
             stop = target if firing is None else min(firing, target)
@@ -314,6 +354,7 @@ class MuJoCo:
             if view.is_watched:
                 view.record()
         view.is_stepping = False
+        self._lock.use(target - before)
         if self._viewer is not None:
             self._viewer.sync()
 

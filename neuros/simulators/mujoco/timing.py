@@ -159,11 +159,12 @@ class Pacer:
 class StepLock:
     """Lock of model and data: the stepping thread holds it bout by bout, and visitors go first.
 
-    It also holds the pause, in which no step begins. A plain lock would starve visitors: the
-    stepping thread would acquire it again at once.
+    It also holds the pause, in which no step begins but those that are granted. A plain lock would
+    starve visitors: the stepping thread would acquire it again at once.
     """
 
     def __init__(self) -> None:
+        self._granted = 0
         self._changed = threading.Condition()
         self._one_visitor = threading.RLock()
         self._visitors = 0
@@ -193,6 +194,27 @@ class StepLock:
             self.is_paused = False
             self._changed.notify_all()
 
+    def grant(self, count: int, cancelled: Callable[[], bool]) -> int:
+        """Let ``count`` steps begin in the pause, and wait until they have ended.
+
+        Returns those that are missing, once ``cancelled()``, or if the pause ends before.
+        """
+        with self._changed:
+            self._granted = count
+            self._changed.notify_all()
+            while self._granted and self.is_paused and not cancelled():
+                self._changed.wait(_IDLE_S)
+            missing, self._granted = self._granted, 0
+            return missing
+
+    def allowed(self, count: int) -> int:
+        """How many of ``count`` steps the pause allows now."""
+        return min(count, self._granted) if self.is_paused else count
+
+    def use(self, count: int) -> None:
+        """So many steps have been made, in a bout."""
+        self._granted = max(0, self._granted - count)
+
     def wake(self) -> None:
         """Make every waiting thread check its condition again."""
         with self._changed:
@@ -211,7 +233,7 @@ class StepLock:
         """
         with self._changed:
             may_try = self._changed.wait_for(
-                lambda: cancelled() or not (self.is_paused or self._visitors), seconds
+                lambda: cancelled() or not (self._visitors or not self.allowed(1)), seconds
             )
             if cancelled() or not may_try:
                 return False

@@ -1,6 +1,7 @@
 // What was clicked: of a node its hooks, of a connection the fields of its packets.
 
 import {element, milliseconds, number, percent, rate, Row} from "./format.js";
+import {LEAST_RING} from "./activity.js";
 import {wantAllOf} from "./wants.js";
 
 export class Details {
@@ -21,7 +22,9 @@ export class Details {
     this.body = element("tbody");
     this.title.textContent = this.plan.topics.find((each) => each.name === name)?.title ?? name;
     const type = this.source ? this.source.type : "";
-    this.box.replaceChildren(element("p", {}, type), element("table", {}, this.body));
+    this.none = element("p", {class: "hint"}, "no packet yet");
+    this.box.replaceChildren(element("p", {class: "hint"}, type), element("table", {}, this.body));
+    if (this.source) this.box.append(this.none);
     wantAllOf(this.source ? this.source.name : null);
     if (kind !== "node" && !this.source) this.box.append("Its sender is not part of this run.");
   }
@@ -55,15 +58,16 @@ export class Details {
 
   showSample(name, sample) {
     if (!this.source || name !== this.source.name) return;
+    if (sample.fault || sample.all) this.none.remove();
     if (sample.fault) this.row("fault").show("cannot be shown", sample.fault);
     for (const [path, value] of Object.entries(sample.all ?? {})) {
       const isNumber = typeof value !== "string";
       if (!this.rows.has(path)) {
         const {cells: [cell]} = this.row(path);
         cell.append(isNumber ? this.button(name, path) : path);
-        // What has an element 0 that is a number is an array of numbers.
+        // What has an element 0 that is a number is an array of numbers; a few are better plotted.
         const array = path.endsWith(".length") ? path.slice(0, -".length".length) : null;
-        if (array && `${array}[0]` in sample.all) {
+        if (array && value >= LEAST_RING && `${array}[0]` in sample.all) {
           cell.append(" ", element("button", {class: "field", title: `draw ${array} as a heat map`,
             onclick: () => this.onArray(name, array)}, "heat map"));
         }

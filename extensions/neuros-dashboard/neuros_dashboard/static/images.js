@@ -21,17 +21,19 @@ export class Images {
       });
       const size = element("span");
       const image = element("img", {alt: source.title});
+      const none = element("p", {class: "none"}, "no picture yet");
       box.append(element("div", {class: "picture", "data-source": source.name},
-        element("h3", {}, element("label", {}, switched, ` ${source.title}`), size), image));
-      this.pictures.set(source.name, {image, size, switched});
+        element("h3", {}, element("label", {}, switched, ` ${source.title}`), size), image, none));
+      this.pictures.set(source.name, {image, none, size, switched});
     });
     this.atFirst = images.slice(0, SHOWN_AT_FIRST).map((source) => source.name);
   }
 
   switch(name) {
-    const {image, switched} = this.pictures.get(name);
+    const {image, none, switched} = this.pictures.get(name);
     want(name, (entry) => { entry.image = this.isOn && switched.checked; });
     image.hidden = !switched.checked;
+    none.hidden = image.hidden || image.hasAttribute("src");
   }
 
   // Whether the page shows this panel.
@@ -54,10 +56,12 @@ export class Images {
   show(name, sample) {
     const picture = this.pictures.get(name);
     if (!picture) return;
-    if (sample.fault) picture.size.textContent = sample.fault;
+    if (sample.fault) picture.none.textContent = sample.fault;
     if (!sample.image) return;
-    picture.image.src = sample.image.url ?? "";
-    const [width, height] = sample.image.of;
-    picture.size.textContent = `${width ? `${width} × ${height} ` : ""}${sample.image.encoding}`;
+    const {url, of: [width, height], encoding} = sample.image;
+    if (url) picture.image.src = url;
+    else picture.none.textContent = `a browser shows no image in the format ${encoding}`;
+    picture.none.hidden = Boolean(url) || picture.image.hidden;
+    picture.size.textContent = `${width ? `${width} × ${height} ` : ""}${encoding}`;
   }
 }

@@ -10,7 +10,7 @@ const WIDTHS = ["narrow", "wide", "full"]; // one, two and three thirds of the p
 const RASTERS_AT_FIRST = 2;
 const AT_FIRST = [
   ["world", "full"], ["graph", "wide"], ["details", "narrow"], ["connections", "wide"],
-  ["nodes", "narrow"], ["series", "wide"], ["images", "narrow"], ["log", "wide"],
+  ["nodes", "narrow"], ["series", "full"], ["images", "full"], ["log", "wide"],
   ["load", "narrow"],
 ];
 
@@ -43,7 +43,9 @@ export class Layout {
 
   get panelsAtFirst() {
     const rasters = this.plan.sources.filter((source) => source.is_spikes);
-    const panels = AT_FIRST.map(([panel, width]) => ({panel, width}));
+    const hasImages = this.plan.sources.some((source) => source.is_image);
+    const panels = AT_FIRST.filter(([panel]) => hasImages || panel !== "images").map(
+      ([panel, width]) => ({panel, width}));
     panels.splice(3, 0, ...rasters.slice(0, RASTERS_AT_FIRST).map(
       (source) => ({panel: "raster", output: source.name, width: "full"})));
     return panels;
@@ -220,7 +222,7 @@ class OutputPanel {
       layout.changed();
     }}, ...fitting.map((source) => new Option(source.title, source.name)));
     this.chooser.value = panel.output;
-    this.told = element("span");
+    this.told = element("span", {}, "no packet yet");
     this.box = element("div");
     this.section = element("section", {"data-panel": panel.panel},
       element("h2", {}, `${this.kind.title} `, this.chooser, " ", this.told), this.box,
@@ -237,7 +239,7 @@ class OutputPanel {
     this.box.replaceChildren();
     const {plan} = this.layout;
     this.source = plan.sources.find((source) => source.name === this.panel.output);
-    this.told.textContent = this.panel.field ?? "";
+    if (this.panel.field) this.told.textContent = `${this.panel.field}: no packet yet`;
     this.drawn = null;
     if (!this.source) {
       this.box.append(element("p", {class: "body"},

@@ -3,7 +3,7 @@
 import {element} from "./format.js";
 
 const KEPT = 2000;
-const RECORD = /^\[([A-Z]+)\] (?:\[[\d.]+\] )?\[([^\]]+)\]:? ?(.*)$/s;
+const RECORD = /^\[([A-Z]+)\] (?:\[([\d.]+)\] )?\[[^\]]+\]/;
 const LEVELS = {DEBUG: 0, INFO: 1, WARN: 2, ERROR: 3, FATAL: 3};
 
 export class Log {
@@ -23,8 +23,11 @@ export class Log {
 
   add(lines) {
     const isAtEnd = this.box.scrollHeight - this.box.scrollTop - this.box.clientHeight < 40;
-    for (const text of lines) {
-      const line = {text, severity: RECORD.exec(text)?.[1] ?? "INFO"};
+    for (const record of lines) {
+      const [, severity = "INFO", stampS] = RECORD.exec(record) ?? [];
+      // Seconds since 1970 tell a reader nothing.
+      const text = stampS ? record.replace(stampS, timeOfDay(1000 * stampS)) : record;
+      const line = {text, severity};
       this.lines.push(line);
       if (this.shows(line)) this.box.append(lineElement(line));
     }
@@ -46,6 +49,12 @@ export class Log {
       return line.text.includes(this.filter.value); // an expression that is only half typed
     }
   }
+}
+
+function timeOfDay(ms) {
+  const options = {hour12: false, hour: "2-digit", minute: "2-digit", second: "2-digit",
+    fractionalSecondDigits: 3};
+  return new Date(ms).toLocaleTimeString("en-GB", options);
 }
 
 function lineElement(line) {

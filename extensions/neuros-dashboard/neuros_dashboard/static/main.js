@@ -30,7 +30,7 @@ const handlers = {
     const details = new Details(plan, series, (...array) => layout.draw(...array));
     const select = (kind, name) => { details.select(kind, name); view.tables.select(name); };
     view = {
-      series, details,
+      plan, series, details,
       graph: new Graph(document.querySelector("#graph"), plan, select),
       tables: new Tables(plan, select),
       images,
@@ -45,9 +45,7 @@ const handlers = {
     view.graph.show(figures);
     view.tables.show(figures);
     view.details.showFigures(figures);
-    const factor = figures.real_time_factor;
-    document.querySelector("#times").textContent = figures.sim_time === null ? ""
-      : `simulated ${figures.sim_time.toFixed(2)} s, ${number(factor, 3)} × real time`;
+    document.querySelector("#times").textContent = timesOf(view.plan, figures);
   },
   samples(samples) {
     for (const [name, sample] of Object.entries(samples)) {
@@ -69,6 +67,14 @@ const handlers = {
   log(lines) { log.add(lines); },
   load(load) { showLoad(load); },
 };
+
+// Which clock is where. In virtual time, a second of it is the one that the factor refers to.
+function timesOf({is_virtual: isVirtual}, {sim_time: simS, virtual_s: virtualS, t, ...figures}) {
+  const times = simS === null ? [] : [`simulated ${simS.toFixed(2)} s`];
+  if (isVirtual) times.push(`virtual time ${virtualS.toFixed(2)} s`);
+  else if (simS !== null) times.push(`${number(figures.real_time_factor, 3)} × real time`);
+  return [...times, `wall clock ${t.toFixed(0)} s`].join(", ");
+}
 
 // Nobody says any more what the nodes do.
 function forgetStates() {

@@ -1,11 +1,12 @@
 // Time series of chosen fields: the last minute, one chart per field.
 
 import {element, number} from "./format.js";
+import {colour, onTheme} from "./theme.js";
 import {want} from "./wants.js";
 
 const KEPT_S = 60;
-const HEIGHT = 150;
-const COLOUR = "#1a66c2";
+const HEIGHT = 166;
+const AXIS = {stroke: () => colour("--faint"), grid: {stroke: () => colour("--line")}};
 
 export class Series {
   constructor() {
@@ -104,9 +105,14 @@ class Chart {
     box.append(this.element);
     this.plot = new uPlot({
       width: this.element.clientWidth - 12, height: HEIGHT, legend: {show: false},
-      scales: {x: {time: false}, y: {range: rangeOf}}, axes: [{size: 28}, {size: 62}],
-      series: [{}, {stroke: COLOUR, width: 1.3, points: {show: true, size: 4, fill: COLOUR, filter: lone}}],
+      scales: {x: {time: false}, y: {range: rangeOf}}, axes: [
+        {...AXIS, size: 28, label: "wall clock, s", labelSize: 16, labelFont: "11px system-ui"},
+        {...AXIS, size: 62},
+      ],
+      series: [{}, {stroke: () => colour("--link"), width: 1.3,
+        points: {show: true, size: 4, fill: () => colour("--link"), filter: lone}}],
     }, this.data, this.element);
+    onTheme(() => this.plot.redraw());
     this.observer = new ResizeObserver(() => this.plot.setSize(
       {width: this.element.clientWidth - 12, height: HEIGHT}));
     this.observer.observe(this.element);

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from neuros.distribution import install_command
 from neuros.errors import Problem
 from neuros.ports import PluginCheck
-from neuros.project.model import NETWORK, Node, Port
+from neuros.project.model import Node, Port
 from neuros.project.scanner import problem_in
 from neuros.project.suggest import did_you_mean, listed
 from neuros_learn.nir.network_file import (
@@ -184,7 +184,7 @@ class _Check(PluginCheck):
 
     def problems(self, node: Node) -> Iterator[Problem]:
         if find_spec("h5py"):
-            for text in problems_of(node, Path(node.environment.get(NETWORK, ""))):
+            for text in problems_of(node, Path(node.environment.get("NETWORK", ""))):
                 yield _at_network(node, text)
 
     def doubts(self, node: Node) -> Iterator[Problem]:
