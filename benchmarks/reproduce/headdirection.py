@@ -55,8 +55,6 @@ VIEWS_PER_S = 40
 """Gathered by a training run for each second of ``--duration``: 2400 of 60 s, as in the example."""
 ACCEPTED_S = 60.0
 """How long runs last for which the accepted errors are meant."""
-_TRAINING_WAYS = 100
-"""Added to the seed of a training run's way: none is driven twice."""
 _SLOWEST = 40
 """Wall seconds per simulated one that a run may take before it is given up."""
 
@@ -71,7 +69,7 @@ def run(name: str, folder: Path, duration_s: float, backend: str) -> None:
             {
                 "trainer.environment.VIEWS": round(VIEWS_PER_S * duration_s),
                 "trainer.environment.SEED": seed,
-                "robot.environment.SEED": _TRAINING_WAYS + seed,
+                "robot.environment.SEED": seed,
             },
         )
     else:

@@ -33,7 +33,7 @@ def draw_ticks(parts: Mapping[str, Sequence[Ticks]], file: Path) -> Path:
                 shown[place] = shown.get(place, 0.0) + percent
             axes.bar(list(shown), list(shown.values()), BIN_MS, align="edge", color=OURS)
             deviation = spread_text([ticks["std_ms"] for ticks in several], "{:.2f}")
-            axes.set_title(f"{title}\nstandard deviation {deviation} ms", loc="left", fontsize=9)
+            axes.set_title(f"{title}\nstandard deviation {deviation} ms", loc="left", fontsize=8)
             axes.set_yscale("log")
             axes.yaxis.set_major_formatter("{x:g}")
             axes.set_xlim(-_BEYOND_MS - 2 * BIN_MS, _BEYOND_MS + 2 * BIN_MS)

@@ -22,15 +22,19 @@ def head_direction(titles: Titles, readings: Readings, file: Path) -> Path:
     with _grid(titles, file, "simulated time (s)", "heading (deg)") as every:
         for name, axes in every.items():
             series = readings[name][0].series
-            for angles, style in (
-                (series.truths, {"color": TRUTH, "markersize": 3}),
-                (series.estimates, {"color": THEIRS, "markersize": 1.5}),
+            for label, angles, style in (
+                ("robot", series.truths, {"color": TRUTH, "markersize": 3}),
+                ("network", series.estimates, {"color": THEIRS, "markersize": 1.5}),
             ):
                 stamps = sorted(angles)
                 heading_deg = [np.degrees(angles[stamp]) for stamp in stamps]
-                axes.plot([stamp * 1e-9 for stamp in stamps], heading_deg, ".", **style)
+                axes.plot(
+                    [stamp * 1e-9 for stamp in stamps], heading_deg, ".", label=label, **style
+                )
             axes.set_yticks(range(-180, 181, 90))
-            axes.set_title(f"{titles[name]} (grey: true)", loc="left", fontsize=9)
+            axes.set_title(titles[name], loc="left", fontsize=9)
+        handles = axes.get_legend_handles_labels()
+        axes.figure.legend(*handles, loc="outside upper right", ncols=2, markerscale=4)
     return file
 
 

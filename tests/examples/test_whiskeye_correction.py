@@ -152,6 +152,56 @@ def look_ahead(integrator, seconds):
     return headings
 
 
+class TestWrongStart:
+    """A ring that starts somewhere else finds the heading that is seen."""
+
+    @pytest.fixture
+    def wrong_start(self, load):
+        pytest.importorskip("nest")
+        return load("wrong_start")
+
+    @pytest.mark.parametrize(
+        ("start_deg", "rate_rad_s"), [(180.0, 0.0), (180.0, 1.0), (-150.0, 1.0)]
+    )
+    def test_it_is_right_within_seconds_and_stays_so(self, wrong_start, start_deg, rate_rad_s):
+        errors = wrong_start.errors_deg(start_deg, rate_rad_s, seed=2)
+        assert abs(errors[0]) > 120
+        assert wrong_start.found_after_s(errors) < 4.0
+
+    def test_a_current_that_does_not_insist_leaves_it_there(self, wrong_start):
+        errors = wrong_start.errors_deg(180.0, 0.0, seed=2, insisting=0.0)
+        assert wrong_start.found_after_s(errors) is None
+        assert np.min(np.abs(errors)) > 150
+
+    def test_views_that_are_wrong_for_a_moment_do_not_carry_it_away(self, load):
+        integrator = load("correction").CorrectedIntegrator(1, 0.0, 300.0, 0.3)
+        look_ahead(integrator, seconds=1)
+        for index in range(51, 151):
+            if index % 5 == 0:
+                wrong = math.pi if index < 66 else 0.0
+                integrator.vision.see(index * PERIOD_NS, wrong, 0.01, EXACT)
+            corrected, _ = integrator.integrate(index * PERIOD_NS, 0.0)
+            assert abs(math.degrees(corrected)) < 15
+
+    def test_it_takes_no_bias_of_the_gyroscope_from_a_wrong_start(self, load):
+        integrator = load("correction").CorrectedIntegrator(
+            1, 0.0, 300.0, 0.3, learning_per_s2=0.2, start_rad=math.pi
+        )
+        look_ahead(integrator, seconds=3)
+        assert integrator.learnt_rad_s == pytest.approx(0.0, abs=1e-3)
+
+    def test_a_mismatch_is_believed_after_a_second_and_later_where_headings_are_less_exact(
+        self, load
+    ):
+        believed = []
+        for weight in (1.0, 0.25):
+            mismatch = load("correction").Mismatch()
+            for _ in range(50):
+                mismatch.see(math.pi, weight, 0.02)
+            believed.append(mismatch.mean)
+        assert believed == pytest.approx([1 - math.exp(-1), 1 - math.exp(-0.25)])
+
+
 @pytest.mark.acceptance
 def test_the_bias_of_the_gyroscope_is_learnt_from_what_it_and_vision_differ_by(load):
     pytest.importorskip("nest")

@@ -8,6 +8,9 @@ import math
 from pathlib import Path
 
 import pytest
+from geometry_msgs.msg import PoseStamped, Vector3Stamped
+
+from neuros.testing import PluginHarness
 
 EXAMPLE = Path(__file__).parents[2] / "examples/4_neurorobotics/whiskeye"
 PERIOD_NS = 20_000_000
@@ -123,6 +126,22 @@ class TestPlot:
         plot.redraw(turning(1.0, 400), turning(1.0, 300))
         plot.save(tmp_path / "heading.png", "a caption")
         assert (tmp_path / "heading.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_error_is_a_result_of_the_run_and_so_a_column_of_a_sweep(tmp_path):
+    pytest.importorskip("matplotlib")
+    with PluginHarness.from_project(
+        EXAMPLE / "strict.json", "visualiser", run_folder=tmp_path
+    ) as visualiser:
+        pose, estimate = PoseStamped(), Vector3Stamped()
+        pose.pose.orientation.w, estimate.vector.z = 1.0, math.radians(2.0)
+        visualiser.send("truth", pose)
+        visualiser.send("estimate", estimate)
+        visualiser.run()
+        visualiser.finalise()
+        results = json.loads((visualiser.run_dir / "results.json").read_text())
+    assert results["rms_deg"] == results["max_deg"] == pytest.approx(2.0)
+    assert results["samples"] == 1
 
 
 def test_the_csv_keeps_every_bit_and_leaves_lost_values_empty(load, tmp_path):

@@ -57,6 +57,20 @@ def test_the_cues_are_irregular(room):
     assert len({tuple(room.geom_rgba[index]) for index in cues}) == 10
 
 
+@pytest.mark.needs("OpenGL")
+def test_training_and_test_take_other_ways_with_one_seed():
+    """A sweep gives all nodes the same SEED."""
+    ends = []
+    for project in ("training.json", "prediction.json"):
+        same = {"SEED": "1", "RATE": "1", "SPEED": "0.4", "NEUROS_RANDOMISE_DIRECTION": "0"}
+        with PluginHarness.from_project(EXAMPLE / project, "robot", environment=same) as robot:
+            robot.run(executions=1)
+            data = robot.node.get_user_data().sim.data
+            ends.append([data.actuator(f"whiskeye/pose_{axis}").ctrl[0] for axis in "xy"])
+    directions = [math.atan2(y, x) for x, y in ends]
+    assert abs(math.remainder(directions[0] - directions[1], math.tau)) > 0.1
+
+
 def way(wanderer, seconds, step_s=0.02):
     """Positions and rates of a base that does as it is told."""
     place, told = np.zeros(2), []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from typing import Any
 
@@ -11,7 +12,10 @@ from neuros.time import to_nanoseconds
 
 
 def start_integrator(node: Any) -> None:
-    """Make the rings of SEED, GYRO_BIAS in rad/s, CORRECTION_PA, GATE and LEARNING of the node."""
+    """Make the rings of the node.
+
+    SEED, GYRO_BIAS in rad/s, CORRECTION_PA, GATE, LEARNING, and START_DEG: how far off they start.
+    """
     node.set_user_data(
         CorrectedIntegrator(
             int(os.environ.get("SEED", "1")),
@@ -19,6 +23,7 @@ def start_integrator(node: Any) -> None:
             float(os.environ.get("CORRECTION_PA", "300")),
             float(os.environ.get("GATE", str(GATE))),
             float(os.environ.get("LEARNING", "0")),
+            math.radians(float(os.environ.get("START_DEG", "0"))),
         )
     )
 

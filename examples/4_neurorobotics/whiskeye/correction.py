@@ -8,6 +8,11 @@ How hard it pulls depends on how exact the heading is: by the inverse of its var
 filter weighs what it measures. Else the ring would follow the worst views as closely as the best,
 and one whose gyroscope is right would lose by what it sees.
 
+A Gaussian current alone cannot move a bump that is 180 degrees off: it pulls to both sides alike,
+and the inhibition of the bump keeps a second one from rising. So it grows with the square of how
+far the ring has been off lately (:class:`Mismatch`), until a new bump rises where the heading is
+seen and the old one ends. A single wrong view does not last long enough for that.
+
 The bias of the gyroscope is learnt from what vision and the turned gyroscope differ by in the long
 run, as in Mahony, Hamel & Pflimlin, *IEEE Transactions on Automatic Control* 53(5) (2008). From the
 ring's own heading it would be learnt worse: the ring lags, and slips by some percent of its rate,
@@ -27,6 +32,9 @@ LEAD_S = 0.06  # how late the ring follows: so far ahead a current holds the bum
 WIDTH_RAD = math.radians(30.0)
 EXACT_RAD = math.radians(1.0)  # a heading as exact as this is pulled to with all of the gain
 GATE = 0.12  # see README.md
+MISMATCH_PER_S = 1.0  # how fast a mismatch is believed, by headings that are exact
+INSISTING = 6.0
+ASTRAY_RAD = math.radians(30.0)  # no bias of a gyroscope explains a heading that is so far off
 FOLLOWS_PER_S = 2.0  # how fast the heading by gyroscope, from which the bias is learnt, is pulled
 
 
@@ -70,6 +78,22 @@ class SeenHeading:
         return heading_rad + turned_rad - then_rad, weight
 
 
+class Mismatch:
+    """How far the ring has been off what was seen lately: 0 not at all, 1 by 180 degrees.
+
+    A running mean of ``(1 - cos(difference)) / 2``, weighed like the headings that were seen: exact
+    ones are believed after one second, others after longer. Without any it stays as it is.
+    """
+
+    def __init__(self) -> None:
+        self.mean = 0.0
+
+    def see(self, difference_rad: float, weight: float, passed_s: float) -> None:
+        """The ring was off by so much for so long."""
+        share = 1.0 - math.exp(-MISMATCH_PER_S * weight * passed_s)
+        self.mean += share * ((1.0 - math.cos(difference_rad)) / 2.0 - self.mean)
+
+
 class CorrectedIntegrator:
     """Integrates the gyroscope with both rings, and pulls one of them to where vision says.
 
@@ -80,6 +104,8 @@ class CorrectedIntegrator:
         gate: see :class:`SeenHeading`.
         learning_per_s2: how fast the gyroscope's bias is learnt from what vision and the turned
             gyroscope differ by, in rad/s per rad and second; 0: it is not.
+        start_rad: what both rings call the heading at the start; 0 is right.
+        insisting: how many times the gain is added where all of late was seen 180 degrees off.
 
     Attributes:
         learnt_rad_s: the bias that has been learnt; the corrected ring is driven without it.
@@ -92,17 +118,22 @@ class CorrectedIntegrator:
         peak_pa: float,
         gate: float,
         learning_per_s2: float = 0.0,
+        start_rad: float = 0.0,
+        insisting: float = INSISTING,
     ) -> None:
         self.alone = HeadDirectionNetwork(seed)
         self.corrected = HeadDirectionNetwork(seed, beside=self.alone)
         self.alone.settle()
+        for ring in (self.alone, self.corrected):
+            ring.call_heading(start_rad)
+        self._mismatch, self._insisting = Mismatch(), insisting
         self.vision = SeenHeading(gate)
         self._integrator = GyroIntegrator(self.alone, bias_rad_s)
         self._bias_rad_s, self._peak_pa = bias_rad_s, peak_pa
         self._learning_per_s2 = learning_per_s2
         self.learnt_rad_s = 0.0
         self._bridged_rad, self._done_ns = 0.0, 0
-        self._by_gyroscope_rad = 0.0
+        self._by_gyroscope_rad = math.nan  # unknown until a heading was seen
 
     def integrate(self, stamp_ns: int, rate_rad_s: float) -> tuple[float, float]:
         """Headings in rad at this stamp: of the ring that is corrected, and of the ring alone."""
@@ -114,7 +145,10 @@ class CorrectedIntegrator:
         else:
             # The rings have not simulated what was bridged: they are behind by as much.
             target_rad = seen[0] + corrected_rad_s * LEAD_S - self._bridged_rad
-            self.corrected.correct(target_rad, self._peak_pa * seen[1], WIDTH_RAD)
+            off_rad = self.corrected.heading_rad - target_rad
+            self._mismatch.see(off_rad, seen[1], (stamp_ns - self._done_ns) * 1e-9)
+            gain = seen[1] + self._insisting * self._mismatch.mean**2
+            self.corrected.correct(target_rad, self._peak_pa * gain, WIDTH_RAD)
         self.corrected.offset_rad_s = -self.learnt_rad_s
         bridged_rad, bridged_s = self._integrator.bridged_rad, self._integrator.bridged_s
         alone_rad = self._integrator.integrate(stamp_ns, rate_rad_s)
@@ -130,6 +164,8 @@ class CorrectedIntegrator:
         self._by_gyroscope_rad += rate_rad_s * passed_s
         if seen is not None:
             ahead_rad = math.remainder(self._by_gyroscope_rad - seen[0], math.tau)
+            if not abs(ahead_rad) <= ASTRAY_RAD:  # the start, or it was carried off
+                self._by_gyroscope_rad, ahead_rad = seen[0], 0.0
             weighed_s_rad = passed_s * seen[1] * ahead_rad
             self._by_gyroscope_rad -= FOLLOWS_PER_S * weighed_s_rad
             self.learnt_rad_s += self._learning_per_s2 * weighed_s_rad

@@ -107,6 +107,11 @@ class DoubleRing(ABC):
             ring._zero_rad, ring._heading_rad = float(zero_rad), 0.0
         return self._heading_rad
 
+    def call_heading(self, heading_rad: float) -> None:
+        """Call that heading where the bump is now. The bump stays."""
+        self._zero_rad += self._heading_rad - heading_rad
+        self._heading_rad = math.remainder(heading_rad, math.tau)
+
     def step(self, rate_rad_s: float, duration_s: float) -> float:
         """Turn at ``rate_rad_s`` for ``duration_s``; returns the heading decoded over that time.
 

@@ -7,10 +7,11 @@ Every layer predicts the one below it, and is corrected by how far its predictio
 A generative model: *causes* ``c`` are inferred for each view by descending the energy, half the sum
 of squared errors of all predictions ``f(c) W``; then the weights descend the same energy at these
 causes, with rates after Adam. Both rules are local: a weight changes by the error it predicts into,
-times the cause it predicts from. While it learns the heading is given, and is predicted like the
-view, from the uppermost causes. Afterwards the causes are inferred from the view alone, and the
-heading is read off the causes of all layers: where place changes the view as well, the uppermost
-ones alone tell it half as exactly.
+times the cause it predicts from. The read-out of the heading is not local: it is solved in closed
+form, a ridge regression over all views that were learnt. While it learns the heading is given, and
+is predicted like the view, from the uppermost causes. Afterwards the causes are inferred from the
+view alone, and the heading is read off the causes of all layers: where place changes the view as
+well, the uppermost ones alone tell it half as exactly.
 
 Rao & Ballard, *Nature Neuroscience* 2, 79 (1999); Dora, Pennartz & Bohte, ICANN (2018); for place
 and heading of a robot Struckmeier et al., arXiv:1909.07201 (2019). Written anew, and smaller.

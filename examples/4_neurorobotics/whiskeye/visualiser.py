@@ -59,6 +59,8 @@ def report(node):
         return
     error = heading_error(headings.plot.redraw(headings.estimates, headings.truths))
     write_csv(node.run_dir / "head_direction.csv", headings.estimates, headings.truths)
+    for name, value in asdict(error).items():
+        node.set_result(name, value)
     counts = {"estimates": len(headings.estimates), "truths": len(headings.truths)}
     result = {**asdict(error), **counts}
     (node.run_dir / "head_direction.json").write_text(json.dumps(result, indent=2) + "\n")

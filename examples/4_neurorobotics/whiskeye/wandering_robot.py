@@ -20,16 +20,19 @@ class WanderingRobot:
     """WhiskEye in ``room.xml``: RATE, SPEED, SEED and NEUROS_RANDOMISE_DIRECTION of the node.
 
     After CHANGE_S simulated seconds each cue of the room has the colour of the one before it.
+
+    Args:
+        first_way: is added to SEED: with one SEED, training and test take different ways.
     """
 
-    def __init__(self, node: Any) -> None:
+    def __init__(self, node: Any, first_way: int = 0) -> None:
         self.sim = MuJoCo(node, "room.xml")
         self.sim.actuate(f"{ROBOT}neck_gmbl", LOOK_AHEAD_RAD)
         self._wanderer = Wanderer(
             float(os.environ.get("RATE", "1.0")),
             randomise=os.environ.get("NEUROS_RANDOMISE_DIRECTION", "0") != "0",
             speed_m_s=float(os.environ.get("SPEED", "0.2")),
-            seed=derive_seed(int(os.environ.get("SEED", "1")), node.name),
+            seed=derive_seed(first_way + int(os.environ.get("SEED", "1")), node.name),
         )
         self._change_s = float(os.environ.get("CHANGE_S", "inf"))
         self.steer()

@@ -23,9 +23,12 @@ OnRow: TypeAlias = "Callable[[int, int, Mapping[str, Any]], None]"
 
 def _seeds(text: str) -> tuple[int, ...]:
     try:
-        return tuple(int(part) for part in text.split(","))
+        ends = [[int(end) for end in part.split("..", 1)] for part in text.split(",")]
     except ValueError:
-        raise ArgumentTypeError(f"'{text}': give whole numbers, as in 1,2,3") from None
+        raise ArgumentTypeError(f"'{text}': give whole numbers, as in 1,2,3 or 1..8") from None
+    if empty := [f"{first}..{last}" for first, *last in ends for last in last if last < first]:
+        raise ArgumentTypeError(f"'{text}': {empty[0]} is empty: give the smaller number first")
+    return tuple(seed for each in ends for seed in range(each[0], each[-1] + 1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +54,7 @@ class SweepOptions:
         metavar="SEED,...",
         default_help="as in the files",
         help="run with each of these seeds: every environment variable of a node with SEED in its"
-        " name gets the seed",
+        " name gets the seed; 1..8 are the seeds 1 to 8",
     )
     repeat: int = option(
         "--repeat", parse=positive_number, default=1, metavar="N", help="runs of each combination"

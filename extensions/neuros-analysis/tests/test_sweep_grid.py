@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentTypeError
+
 import pytest
+from neuros_analysis.options import _seeds
 from neuros_analysis.sweep import Point, parse_values, points_of, short_names
 
 from neuros.errors import UsageError
@@ -16,6 +19,19 @@ def test_every_combination_is_a_point_and_the_last_changes_first() -> None:
     assert [(p.settings[RATE], p.seed, p.repeat) for p in points][:5] == [
         (1, 7, 1), (1, 7, 2), (1, 8, 1), (1, 8, 2), (2, 7, 1),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "seeds"), [("1..8", [*range(1, 9)]), ("7,1..3", [7, 1, 2, 3]), ("4..4", [4])]
+)
+def test_seeds_are_numbers_and_ranges(text: str, seeds: list[int]) -> None:
+    assert [*_seeds(text)] == seeds
+
+
+@pytest.mark.parametrize("text", ["8..1", "1..", "..3", "1-3", "1..3..5", ""])
+def test_seeds_that_are_none_are_refused(text: str) -> None:
+    with pytest.raises(ArgumentTypeError, match=r"whole numbers|smaller number first"):
+        _seeds(text)
 
 
 def test_without_seeds_and_repetitions_there_are_no_columns_for_them() -> None:
