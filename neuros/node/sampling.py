@@ -216,11 +216,6 @@ class _Request:
         """Whether no further packet is wanted."""
         return all(part.is_full for part in self._parts)
 
-    @property
-    def _wants_packet(self) -> bool:
-        packets = self._packets
-        return packets is not None and len(packets) < MOST_VALUES and self._room > 0
-
     def sample(self, packet: Any, encode: Callable[[], bytes]) -> None:
         """Sample a packet; what cannot be read of it is no fault of the node's."""
         for part in self._parts:
