@@ -26,8 +26,8 @@ def _seeds(text: str) -> tuple[int, ...]:
         ends = [[int(end) for end in part.split("..", 1)] for part in text.split(",")]
     except ValueError:
         raise ArgumentTypeError(f"'{text}': give whole numbers, as in 1,2,3 or 1..8") from None
-    if empty := [f"{each[0]}..{each[-1]}" for each in ends if each[-1] < each[0]]:
-        raise ArgumentTypeError(f"'{text}': {empty[0]} is empty: give the smaller number first")
+    if any(each[-1] < each[0] for each in ends):
+        raise ArgumentTypeError(f"'{text}': give the smaller number of a range first, as in 1..8")
     return tuple(seed for each in ends for seed in range(each[0], each[-1] + 1))
 
 

@@ -30,7 +30,7 @@ def test_seeds_are_numbers_and_ranges(text: str, seeds: list[int]) -> None:
 
 @pytest.mark.parametrize("text", ["8..1", "1..", "..3", "1-3", "1..3..5", ""])
 def test_seeds_that_are_none_are_refused(text: str) -> None:
-    with pytest.raises(ArgumentTypeError, match=r"whole numbers|smaller number first"):
+    with pytest.raises(ArgumentTypeError, match=r"whole numbers|smaller number of a range first"):
         _seeds(text)
 
 
