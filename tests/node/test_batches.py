@@ -28,7 +28,7 @@ def numbers(text: str, code: str) -> list[float]:
 
 def asked(wanted: dict[str, Any], *packets: Any) -> dict[str, Any]:
     """What a sampler answers of these packets."""
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     sampler.ask({"out": wanted})
     for packet in packets:
         sampler.sample("out", packet)
@@ -58,7 +58,7 @@ def test_of_too_many_spikes_the_first_ones_are_shown_and_the_others_counted() ->
 
 
 def test_after_a_page_was_left_packets_are_looked_at_no_longer() -> None:
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     sampler.ask({"out": {"spikes": True}})
     for _ in range(MOST_PACKETS):
         sampler.sample("out", spikes([], []))

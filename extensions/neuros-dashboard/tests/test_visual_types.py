@@ -17,7 +17,7 @@ from neuros.node.sampling import Sampler
 
 def seen(source: VisualTypes, packet: Any) -> list[Mark]:
     """What is shown of a packet that a real node has sampled."""
-    sampler = Sampler()
+    sampler = Sampler(bytes)
     sampler.ask({"o": source.wanted()})
     sampler.sample("o", packet)
     return list(source.marks(sampler.ask({})["o"]))
