@@ -46,7 +46,7 @@ def show(passage: Passage, packet: Any, data: bytes | None = None) -> None:
 
 @pytest.mark.parametrize("way", [Way.SENT, Way.TO_ITSELF])
 def test_the_sampler_is_on_a_tap_only_while_it_is_asked(way: Way) -> None:
-    sampler, passage = Sampler(), Passage(way, NUMBER)
+    sampler, passage = Sampler(bytes), Passage(way, NUMBER)
     sampler.attach(passage)
     assert not passage.observers
     sampler.ask({"other": {"all": True}})
@@ -58,7 +58,7 @@ def test_the_sampler_is_on_a_tap_only_while_it_is_asked(way: Way) -> None:
 
 
 def test_the_sampler_knows_an_external_input_by_its_topic() -> None:
-    sampler, passage = Sampler(), Passage(Way.HEARD, Port("scan", NUMBER.type, "/laser"))
+    sampler, passage = Sampler(bytes), Passage(Way.HEARD, Port("scan", NUMBER.type, "/laser"))
     sampler.attach(passage)
     sampler.ask({"/laser": {"all": True}})
     show(passage, Int32(data=6))
