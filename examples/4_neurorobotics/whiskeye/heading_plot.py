@@ -18,6 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 REDRAW_PERIOD_S = 0.2
+REDRAW_PAUSES = 4
 SIZE_INCHES = (7.0, 4.5)
 TOOLKITS = ("QtAgg", "TkAgg", "macosx")
 NO_WINDOW = "the plot has no window and is saved at the end: "
@@ -50,10 +51,15 @@ class HeadingPlot:
         self._label()
 
     def redraw_if_due(self, estimates: Mapping[int, float], truths: Mapping[int, float]) -> None:
-        """Redraw unless that was done less than a fifth of a second ago (wall time)."""
-        if self._every_time or time.monotonic() >= self._next_redraw:
+        """Redraw unless that was done less than a fifth of a second ago (wall time).
+
+        A long run has much to draw, so the pause is at least four times as long as a redraw takes.
+        """
+        start_s = time.monotonic()
+        if self._every_time or start_s >= self._next_redraw:
             self.redraw(estimates, truths)
-            self._next_redraw = time.monotonic() + REDRAW_PERIOD_S
+            now_s = time.monotonic()
+            self._next_redraw = now_s + max(REDRAW_PERIOD_S, REDRAW_PAUSES * (now_s - start_s))
 
     def redraw(self, estimates: Mapping[int, float], truths: Mapping[int, float]) -> Comparison:
         """Redraw now; returns what the lower axes show."""
