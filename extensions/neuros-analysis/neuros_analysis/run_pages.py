@@ -29,6 +29,7 @@ from neuros.errors import UsageError
 from neuros.node.logs import WORLD_LOG
 from neuros.project.dashboard import ARRAYS, SPIKES
 from neuros.project.scanner import read_bytes
+from neuros.project.timing import VIRTUAL
 from neuros.recording.columns import has_simulated_time
 from neuros.registry import back_end_of
 from neuros_analysis import charts
@@ -68,6 +69,8 @@ def report_page(
     facts = [str(record.get("reason") or "ended normally")]
     if record.get("sim_s") is not None:
         facts.append(f"{record['sim_s']:.2f} s of simulated time")
+    if record.get("virtual_s") is not None:
+        facts.append(f"{record['virtual_s']:.2f} s of virtual time")
     if record.get("wall_s") is not None:
         facts.append(f"{record['wall_s']:.2f} s of wall time")
     if record.get("real_time_factor"):
@@ -79,7 +82,7 @@ def report_page(
         text = f"<p>What this page lacks:</p><ul>{items}</ul>"
         parts.append(f'<div class="missing">{text}</div>')
     parts += [figure_part(title, text, data) for title, (text, data) in figures.items()]
-    parts += [_connections(run), _provenance(run)]
+    parts += [_connections(run), *_declared_times(run), _provenance(run)]
     return page(f"Run of {run.name}", parts)
 
 
@@ -148,6 +151,24 @@ def _connections(run: ReviewedRun) -> str:
 
 def _number(value: float | None, digits: int) -> str:
     return "?" if value is None else f"{value:,.{digits}f}"
+
+
+def _declared_times(run: ReviewedRun) -> list[str]:
+    """What moved the clock of a run in virtual time: a table, if anything was declared."""
+    project = run.record.get("expanded_project") or {}
+    if project.get("time") != VIRTUAL:
+        return []
+    rows = [
+        [f"{node['name']}.{hook}", "duration of the hook", json.dumps(value)]
+        for node in project.get("nodes", ())
+        for hook, value in node.get("durations", {}).items()
+    ]
+    for each in project.get("connections", ()):
+        source = f"{each['source_node']}.{each['source_output']}"
+        name = f"{source} -> {each['destination_node']}.{each['destination_input']}"
+        rows += [[name, key, json.dumps(each[key])] for key in ("delay", "loss") if key in each]
+    title, header = "Declared times, in s of virtual time", ["hook or connection", "what", "value"]
+    return [table_part(title, header, rows, "text")] if rows else []
 
 
 def _provenance(run: ReviewedRun) -> str:

@@ -120,3 +120,33 @@ def test_shares_of_time_are_the_same_on_the_console_in_words_and_in_figures(
     assert [name for name, _ in compared] == [*executing]
     for name, share in compared:  # with a digit more
         assert abs(float(share) - int(executing[name].rstrip("%"))) <= 0.5 + 1e-9
+
+
+def test_a_page_of_virtual_time_has_what_was_declared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, ends = tmp_path / "run", "sender.number.receiver.number"
+    finished = launch(
+        pipeline(tmp_path),
+        *("--backend", "in-process", "--time", "virtual", "-o", str(run)),
+        *(
+            "--set",
+            'nodes.sender.durations={"send": 0.005}',
+            "--set",
+            f"connections.{ends}.delay=0.04",
+        ),
+        cwd=tmp_path,
+    )
+    assert finished.exit_code == 0, finished.output
+    assert main(["report", str(run)]) == 0
+    page = (run / "report/report.html").read_text("utf-8")
+    assert re.search(r"\d\.\d\d s of virtual time", page)
+    rows = [re.findall("<td>(.*?)</td>", row) for row in re.findall("<tr>(.*?)</tr>", page)]
+    assert ["sender.send", "duration of the hook", "0.005"] in rows
+    assert ["sender.number -&gt; receiver.number", "delay", "0.04"] in rows
+
+    record = json.loads((run / "run.json").read_text())
+    record["expanded_project"]["nodes"][0]["durations"] = 5
+    (run / "run.json").write_text(json.dumps(record))
+    assert main(["report", str(run)]) == 4
+    assert "run.json is broken: $.expanded_project.nodes[0].durations" in capsys.readouterr().err
