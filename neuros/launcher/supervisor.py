@@ -459,8 +459,6 @@ class Supervisor:
         self.outcome.is_paused = self.pause.is_on
         if self.outcome.started_s is not None:
             self.outcome.paused_s = self.pause.total_s - self._paused_before_s
-        if self.phase is Phase.STOPPING and self.pause.is_on:  # nodes do not go on before they end
-            self.outcome.ending_s = self.pause.since_s
         self._show(self._detector.remarks_on_hooks())
         if self.phase in _BEFORE_STOP:
             self._show(self._detector.remarks_on_silence(now_s))
@@ -610,6 +608,8 @@ class Supervisor:
         self.phase = Phase.STOPPING
         now_s = time.monotonic()
         self.outcome.begin_to_end(now_s)
+        if self.pause.is_on:  # nodes do not go on before they end
+            self.outcome.ending_s = self.pause.since_s
         for node in self._nodes.values():
             node.begin_to_end(now_s)
         self._peers.stop(self.outcome.exit_code, self.outcome.reason)

@@ -24,16 +24,18 @@ class Kept:
     """Records the packets of the output ``number``, until it fails."""
 
     def __init__(self) -> None:
-        self.packets: list[tuple[int, bytes, float | None]] = []
+        self.packets: list[tuple[int, bytes, float | None, int | None]] = []
         self.is_full = self.is_closed = False
 
     def stream(self, way: Way, name: str) -> int | None:
         return 7 if (way, name) == (Way.SENT, "number") else None
 
-    def keep(self, stream: int, data: bytes, sim_time_s: float | None) -> None:
+    def keep(
+        self, stream: int, data: bytes, sim_time_s: float | None, virtual_ns: int | None
+    ) -> None:
         if self.is_full:
             raise OSError(28, "No space left on device")
-        self.packets.append((stream, data, sim_time_s))
+        self.packets.append((stream, data, sim_time_s, virtual_ns))
 
     def close(self) -> None:
         self.is_closed = True
@@ -71,6 +73,7 @@ def test_the_recorder_is_on_the_taps_that_are_recorded_and_encodes_once() -> Non
         kept,
         lambda packet: b"made",
         lambda: 1.5,
+        lambda: 250,
         LocalLogger("a", lambda _, record: records.append(record)),
     )
     ways = (Way.SENT, NUMBER), (Way.SENT, CLOCK), (Way.RECEIVED, NUMBER, CONNECTION)
@@ -80,7 +83,7 @@ def test_the_recorder_is_on_the_taps_that_are_recorded_and_encodes_once() -> Non
     assert [len(passage.observers) for passage in passages] == [1, 0, 0]
     show(passages[0], Int32(), b"published")
     show(passages[0], Int32())
-    assert kept.packets == [(7, b"published", 1.5), (7, b"made", 1.5)]
+    assert kept.packets == [(7, b"published", 1.5, 250), (7, b"made", 1.5, 250)]
 
 
 def test_a_recorder_that_fails_says_so_once_and_the_node_goes_on() -> None:
@@ -88,6 +91,7 @@ def test_a_recorder_that_fails_says_so_once_and_the_node_goes_on() -> None:
     recorder = NodeRecorder(
         kept,
         lambda packet: b"",
+        lambda: None,
         lambda: None,
         LocalLogger("a", lambda _, record: records.append(record)),
     )

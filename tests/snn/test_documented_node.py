@@ -22,7 +22,7 @@ FLOAT = "std_msgs/msg/Float64"
 
 def blocks() -> list[str]:
     """The node, and its hook that sends spikes."""
-    ours, _, _ = PAGE.read_text("utf-8").partition("\n## PyNN and Nengo\n")
+    ours, _, _ = PAGE.read_text("utf-8").partition("\n## Plasticity\n")
     return re.findall(r"```python\n(.*?)```", ours, re.DOTALL)
 
 

@@ -20,7 +20,7 @@ _ACTION, _OBSERVATION = "action", "observation"
 
 
 def export(model: Any, file: str | os.PathLike[str], world: Any) -> dict[str, Any]:
-    """Write a policy, and return the node that runs it: see :func:`neuros.gym.export_policy`.
+    """Write a policy, and return the node that runs it: see ``neuros.gym.export_policy``.
 
     ``world`` is the environment of :mod:`~neuros_learn.gym` that the policy was trained in.
     """

@@ -1,7 +1,7 @@
 """Policies of LeRobot, by that library: R. Cadene et al., "LeRobot", 2024.
 
 Observed numbers are ``observation.state``, an image is one of ``observation.images``, and actions
-are ``action``, as in the datasets that :func:`neuros.datasets.lerobot` writes. The library and
+are ``action``, as in the datasets that ``neuros.datasets.lerobot`` writes. The library and
 PyTorch are imported when a policy is opened. Source of the calls: lerobot 0.4.4,
 ``lerobot/policies/factory.py`` and ``lerobot/utils/control_utils.py``.
 """
