@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import importlib
+import inspect
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -77,6 +78,11 @@ class GuardedTask(rclpy.task.Task):  # type: ignore[misc]
         executor = self._executor()
         if executor is not None:
             executor.create_task(Turn(self._go_on))
+
+    def __del__(self) -> None:
+        if inspect.iscoroutine(handler := getattr(self, "_handler", None)):
+            handler.close()  # else one that the end came before would be "never awaited"
+        super().__del__()
 
     def exception(self) -> BaseException | None:
         """The error of the task; ``None`` for the executor, which asks first."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import re
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 
 from neuros.transport.lean_node import give_up
+from neuros.transport.rclpy_patches import GuardedTask
 
 FAILING_TASK = """
 import rclpy
@@ -41,3 +43,14 @@ def test_fast_dds_is_still_of_the_releases_that_may_hang_at_the_end() -> None:
     give_up(context, [node])
     known = {("fastrtps", "2"), ("fastcdr", "2")}
     assert loaded <= known, "is Fast DDS issue 6513 closed? Then end_discovery may go"
+
+
+def test_a_coroutine_that_the_end_comes_before_is_closed() -> None:
+    """Else Python warns that it was never awaited."""
+
+    async def later() -> None: ...
+
+    task = GuardedTask(later)
+    coroutine = task._handler
+    del task
+    assert inspect.getcoroutinestate(coroutine) == inspect.CORO_CLOSED
