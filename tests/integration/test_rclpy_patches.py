@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
@@ -35,6 +36,7 @@ def test_a_task_that_fails_still_ends_the_process() -> None:
     assert done.returncode == -signal.SIGSEGV, "own_tasks may go: rclpy issue 1641 is corrected"
 
 
+@pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")  # ROS's parser has it
 def test_fast_dds_is_still_of_the_releases_that_may_hang_at_the_end() -> None:
     context = Context()
     rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
