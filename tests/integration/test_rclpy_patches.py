@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import re
 import signal
 import subprocess
@@ -14,6 +15,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 
+from neuros.transport.dds_profile import LOCAL_PROFILES, PROFILES_VARIABLE, RANGE_VARIABLE
 from neuros.transport.lean_node import give_up
 from neuros.transport.rclpy_patches import GuardedTask
 
@@ -32,7 +34,11 @@ executor.spin_until_future_complete(executor.create_task(fail), 20.0)
 
 
 def test_a_task_that_fails_still_ends_the_process() -> None:
-    done = subprocess.run([sys.executable, "-c", FAILING_TASK], capture_output=True, timeout=60)
+    # A process that dies so would leave the shared memory of DDS behind: it gets UDP alone.
+    environment = {**os.environ, PROFILES_VARIABLE: str(LOCAL_PROFILES)}
+    environment[RANGE_VARIABLE] = "SYSTEM_DEFAULT"
+    command = [sys.executable, "-c", FAILING_TASK]
+    done = subprocess.run(command, env=environment, capture_output=True, timeout=60)
     assert done.returncode == -signal.SIGSEGV, "own_tasks may go: rclpy issue 1641 is corrected"
 
 
