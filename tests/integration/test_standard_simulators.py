@@ -7,6 +7,7 @@ folder that the variable ``SIMULATION_INTERFACES`` names; without it, they are s
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import shutil
@@ -23,6 +24,7 @@ from ros_program import RosProgram
 
 from neuros.backends.domain import choose_domain
 from neuros.cli.main import main
+from neuros.installation.progress import Progress
 from neuros.messages.needed import Messages
 from neuros.messages.workspace import Workspaces
 
@@ -52,7 +54,7 @@ def python_path(interfaces: Path | None) -> Iterator[str]:
         yield ""
         return
     messages = Messages(Workspaces(interfaces.parent, None, os.environ), [PACKAGE])
-    messages.make(lambda _: None, os.environ)
+    messages.make(Progress(io.StringIO()), os.environ)
     (folder,) = messages.paths
     sys.path.append(str(folder))
     yield str(folder)
