@@ -68,7 +68,8 @@ def keep_freed_memory() -> None:
     By default it returns what is free at the end of the heap at once. A node with a queue of images
     (0.9 MB each) then has 90 page faults per packet, for a third of the processor time of a packet.
     """
-    if any(name.startswith("MALLOC_") for name in os.environ):
+    tuned = os.environ.get("GLIBC_TUNABLES", "")
+    if "glibc.malloc" in tuned or any(name.startswith("MALLOC_") for name in os.environ):
         return
     with contextlib.suppress(AttributeError):  # another C library
         mallopt = ctypes.CDLL(None).mallopt

@@ -1,4 +1,4 @@
-"""What the supervisor knows of each node: one record, from which all judgements are made.
+"""The supervisor's record of each node, from which all judgements are made.
 
 Nodes that finalise may write pictures, weights and files, which takes as long as it takes: a hook
 that ends, ``node.progress`` and a file that grows in the folder of the node are progress.
@@ -25,7 +25,7 @@ _LOOK_S = 1.0
 
 @dataclass
 class NodeView:
-    """What the supervisor knows of one node. Times are seconds on one monotonic clock.
+    """The record of one node. Times are seconds on one monotonic clock.
 
     Attributes:
         finalise_s: how long it may finalise without progress.

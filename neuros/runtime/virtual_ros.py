@@ -22,7 +22,6 @@ from typing import Any
 import msgspec
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
-from rclpy.subscription import Subscription
 from std_msgs.msg import UInt8MultiArray
 
 from neuros.engine.horizon import (
@@ -475,14 +474,7 @@ class RosVirtualTransport(RosTransport):
         loop.publish = lambda other, states: _publish(publishers[other], states)
         ros.every(ros_node, _TELL_ALL_S, loop.tell_all)
 
-    def _subscribe(
-        self,
-        kind: type,
-        connection: Connection,
-        part: str,
-        qos: QoSProfile,
-        deliver: Callable[[bytes], None],
-    ) -> Subscription:
+    def _unwrapping(self, deliver: Callable[[bytes], None]) -> Callable[[bytes], None]:
         def receive(data: bytes) -> None:
             if data[2:4] != _STATED_MARK:
                 deliver(data)
@@ -491,7 +483,7 @@ class RosVirtualTransport(RosTransport):
             deliver(data[end + -end % _ALIGNMENT :])
             self._virtual.learn(_DECODER.decode(data[_STATED.size : end]))
 
-        return super()._subscribe(kind, connection, part, qos, receive)
+        return receive
 
     def _data_qos(self, connection: Connection, *, is_reader: bool = False) -> QoSProfile:
         return _ALL

@@ -320,6 +320,9 @@ class RosTransport:
     def _position_qos(self, *, is_reader: bool) -> QoSProfile:
         return _LATCHED_READER if is_reader else _LATCHED
 
+    def _unwrapping(self, deliver: Callable[[bytes], None]) -> Callable[[bytes], None]:
+        return deliver
+
     def _on_receiver_found(self, connection: Connection, note: str, inbox: Inbox) -> None:
         """A receiver is there, and has sent ``note`` with its registration."""
         self._prepare(connection, note)
@@ -353,7 +356,7 @@ class RosTransport:
         return self._ros_node.create_subscription(
             kind,
             topic,
-            self._loop.guarded(deliver),
+            self._loop.guarded(self._unwrapping(deliver)),
             qos,
             event_callbacks=self._strangers.callbacks(connection, topic, writer),
             raw=True,

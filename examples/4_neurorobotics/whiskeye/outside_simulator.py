@@ -107,9 +107,13 @@ class Simulator(Node):
         return response
 
 
-if __name__ == "__main__":
+def main(simulator=Simulator):
     try:
         rclpy.init()
-        rclpy.spin(Simulator())
+        rclpy.spin(simulator())
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
+
+
+if __name__ == "__main__":
+    main()

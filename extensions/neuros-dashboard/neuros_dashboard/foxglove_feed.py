@@ -175,7 +175,7 @@ class FoxgloveFeed(ServerListener):
     def _step(self, request: Any) -> bytes:
         asked = json.loads(request.payload or b"{}")
         count = asked.get("count", 1) if isinstance(asked, dict) else None
-        if not isinstance(count, int) or not 1 <= count <= _MOST_STEPS:
+        if type(count) is not int or not 1 <= count <= _MOST_STEPS:
             raise ValueError(f'give {{"count": N}} with N from 1 to {_MOST_STEPS}')
         self._requests.append(Step(count))
         return b"{}"

@@ -6,8 +6,6 @@ import sys
 sys.path.insert(0, os.environ["EXAMPLE"])
 
 import outside_simulator
-import rclpy
-from rclpy.executors import ExternalShutdownException
 from simulation_interfaces.msg import Result
 
 FAULT = os.environ["FAULT"]
@@ -38,8 +36,4 @@ class Simulator(outside_simulator.Simulator):
 
 
 if __name__ == "__main__":
-    try:
-        rclpy.init()
-        rclpy.spin(Simulator())
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+    outside_simulator.main(Simulator)
