@@ -117,6 +117,16 @@ class TestSteppedByAHook:
         assert hook.has_ended()
         assert sim.sim_time == 0.003
 
+    def test_a_control_of_the_hook_waits_until_nobody_else_uses_the_world(
+        self, sim: MuJoCo
+    ) -> None:
+        with sim.paused():
+            hook = Hook(lambda: sim.actuate("turn_speed", 1.5))
+            hook.join(0.2)
+            assert (hook.is_alive(), sim.data.ctrl[0]) == (True, 0.0)
+        assert hook.has_ended()
+        assert sim.data.ctrl[0] == 1.5
+
     def test_one_that_is_not_shared_is_an_error_to_step_in_a_pause(self) -> None:
         alone = MuJoCo(SimulatedNode(), WORLD)
         alone.pause()

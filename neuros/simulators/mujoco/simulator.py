@@ -326,7 +326,7 @@ class MuJoCo:
     # ---- inside -----------------------------------------------------------------------------
 
     def _set(self, command: Command, packet: Packet) -> None:
-        if self._run is None:  # where the plugin steps, no other thread uses the data
+        if self._run is None and not self._is_shared:  # no other thread uses the data
             self._put(command(packet))
         else:
             with self.paused():
