@@ -254,6 +254,10 @@ class TestServedSimulators:
         state = asker.ask("GetEntityState", entity="arm").state
         code, text = asker.refused("SetEntityState", entity="arm", state=state, set_pose=True)
         assert (code, "no free joint" in text) == (result.RESULT_OPERATION_FAILED, True)
+        state.twist.linear.x = float("nan")
+        code, text = asker.refused("SetEntityState", entity="box", state=state, set_twist=True)
+        assert (code, "cannot have" in text) == (result.RESULT_OPERATION_FAILED, True)
+        state.twist.linear.x = 0.0
         state.pose.orientation.w = 7.0
         code, _ = asker.refused("SetEntityState", entity="box", state=state, set_pose=True)
         assert code == asker.srv.SetEntityState.Response.INVALID_POSE

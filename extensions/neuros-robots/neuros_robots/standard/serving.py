@@ -329,6 +329,10 @@ class _Server:
         numbers = [*quaternion, *_get(state.pose.position, "xyz")]
         if sets_pose and not (abs(length - 1) < 1e-3 and all(abs(n) < 1e9 for n in numbers)):
             raise _Refused("INVALID_POSE", f"the pose has numbers that it cannot have: {numbers}")
+        twist = [*_get(state.twist.linear, "xyz"), *_get(state.twist.angular, "xyz")]
+        if sets_twist and not all(abs(n) < 1e9 for n in twist):
+            text = f"the twist has numbers that it cannot have: {twist}"
+            raise _Refused("RESULT_OPERATION_FAILED", text)
         with self._sim.paused():
             self._put_state(self._body(request.entity), state, sets_pose, sets_twist)
 
