@@ -347,7 +347,8 @@ class RosLoop:
         if self._has_older_events:
             return
         next_ns = self._next_due_ns()
-        if next_ns != self._planned_ns or (next_ns and next_ns <= time.monotonic_ns()):
+        is_due = next_ns is not None and next_ns <= time.monotonic_ns()
+        if is_due or next_ns != self._planned_ns:
             self._waker.wake(None)
 
     def _next_due_ns(self) -> int | None:

@@ -78,6 +78,28 @@ def loop(request: pytest.FixtureRequest, context: rclpy.Context) -> Loop:
         return Loop(context)
 
 
+def test_a_timer_that_is_due_at_time_zero_is_called_after_a_long_event(loop: Loop) -> None:
+    """Zero is a time like others. A long event ends the wait for what is older than the timer."""
+    calls = 0
+
+    def long() -> None:
+        end_ns = time.monotonic_ns() + 3_000_000
+        while time.monotonic_ns() < end_ns:
+            pass
+        loop.loop.post_loop_back(long)
+
+    def on_due() -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 10:
+            loop.loop.stop()
+
+    loop.loop.add_timer(lambda: 0, on_due)
+    loop.loop.post(long)
+    loop.run()
+    assert calls == 10
+
+
 def test_events_are_handled_in_the_order_in_which_they_were_posted(loop: Loop) -> None:
     seen: list[int] = []
     for number in range(5):
