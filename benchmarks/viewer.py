@@ -1,4 +1,4 @@
-"""Reads a dashboard as its page does: the stream of events, fields that are plotted, worlds."""
+"""Reads a dashboard as its page does: the stream of events, arrays that are drawn, worlds."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from neuros.control import WORLD
 
 _TIMEOUT_S = 30.0
 
-Plotted = dict[str, dict[str, list[str]]]
-"""By node and output, the fields; for the output ``#world`` the node's world in 3-D."""
+Drawn = dict[str, dict[str, list[str]]]
+"""By node and output, the arrays; for the output ``#world`` the node's world in 3-D."""
 
 
 class Viewer:
@@ -26,10 +26,10 @@ class Viewer:
         counts: how often each event has come.
     """
 
-    def __init__(self, address: str, plotted: Plotted) -> None:
+    def __init__(self, address: str, drawn: Drawn) -> None:
         self.counts: dict[str, int] = {}
         self._address = address
-        self._plotted = plotted
+        self._drawn = drawn
 
     def look(self) -> None:
         """Until the run is over."""
@@ -44,9 +44,9 @@ class Viewer:
     def _want(self, browser: OpenerDirector, page: str) -> None:
         wanted = {
             node: {
-                port: {"fields": fields, "frames": port == WORLD} for port, fields in ports.items()
+                port: {"arrays": arrays, "frames": port == WORLD} for port, arrays in ports.items()
             }
-            for node, ports in self._plotted.items()
+            for node, ports in self._drawn.items()
         }
         body = json.dumps({"page": page, "wanted": wanted}).encode()
         browser.open(urljoin(self._address, "/want"), body, _TIMEOUT_S).close()
@@ -64,9 +64,9 @@ def events_of(lines: Iterable[str]) -> Iterator[tuple[str, Any]]:
 
 
 @contextlib.contextmanager
-def viewing(address: str, plotted: Plotted) -> Iterator[Viewer]:
+def viewing(address: str, drawn: Drawn) -> Iterator[Viewer]:
     """Somebody looks, until the run is over; leaving the block waits for that."""
-    viewer = Viewer(address, plotted)
+    viewer = Viewer(address, drawn)
     thread = threading.Thread(target=viewer.look, daemon=True)
     thread.start()
     try:

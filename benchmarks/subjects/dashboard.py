@@ -1,5 +1,5 @@
-"""What a dashboard costs a run: off, on with nobody looking, open with two fields plotted, and with
-the world in 3-D as well.
+"""What a dashboard costs a run: off, on with nobody looking, open with an array drawn, and with the
+world in 3-D as well.
 
 WhiskEye, strict, a process per node. Whoever looks is a thread of this program, not a browser: what
 a browser takes to draw is not a cost of NeuROS.
@@ -13,13 +13,13 @@ import resource
 from benchmarks.live import live
 from benchmarks.measure import MINIMUM_PAIRS, Case, Figure, Group, Measurement, Subject
 from benchmarks.subjects.whiskeye import RATE, SIMULATED_S, SLICES, WHISKEYE
-from benchmarks.viewer import Plotted, viewing
+from benchmarks.viewer import Drawn, viewing
 from neuros.control import WORLD
 
 OFF, CLOSED, OPEN, IN_3D = "off", "closed", "open", "3-D"
 WORK = "processor_s"
-PLOTTED: Plotted = {"snn": {"estimate": ["vector.z"]}, "robot": {"imu": ["angular_velocity.z"]}}
-SHOWN: dict[str, Plotted] = {OPEN: PLOTTED, IN_3D: {**PLOTTED, "robot": {WORLD: []}}}
+DRAWN: Drawn = {"robot": {"imu": ["orientation_covariance"]}}
+SHOWN: dict[str, Drawn] = {OPEN: DRAWN, IN_3D: {"robot": {**DRAWN["robot"], WORLD: []}}}
 SEEN = ("figures", "samples")
 
 

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from neuros.distribution import EXAMPLES, PACKAGE
 from neuros.errors import Problem
-from neuros.project.dashboard import dashboard_mistakes
+from neuros.project.dashboard import dashboard_mistakes, panels_without_effect
 from neuros.project.message_types import array_type, normalised, with_copies
 from neuros.project.model import CLOCK_TYPE, Connection, Node
 from neuros.project.names import INTERNAL, MOST_CHARACTERS
@@ -369,8 +369,9 @@ def is_for_gazebo(variable: str) -> bool:
 def remarks(parsed: ParsedProject) -> Iterator[Problem]:
     """Possible mistakes in a project without mistakes, but for :func:`unconnected_ports`.
 
-    They are QoS without effect, and what belongs to Gazebo, which has no meaning here.
+    They are panels and QoS without effect, and what belongs to Gazebo, which has no meaning here.
     """
+    yield from panels_without_effect(parsed)
     for node in parsed.nodes:
         for qos in (port.member("qos") for port, _ in _ports_of(node)):
             policies = qos and (qos.string("reliability"), qos.string("durability"))

@@ -57,16 +57,23 @@ def dashboard_mistakes(parsed: ParsedProject) -> Iterator[Problem]:
                 yield member.key_problem(
                     f"'{key}' has no meaning for the panel '{kind}'", f"it may have {has}"
                 )
-        named = [panel.member("output"), *(each.member("output") for each in panel.items("fields"))]
-        for output in (*named, *panel.items("outputs")):
+        for output in (panel.member("output"), *panel.items("outputs")):
             if output is not None and isinstance(output.value, str):
                 yield from _misfit(kind, panel, output, types, is_complete=parsed.is_complete)
-        for element in {"activity": [panel], "series": panel.items("fields")}.get(kind, ()):
-            path, type_name = element.string("field"), types.get(element.string("output") or "", "")
-            if path and normalised(type_name):
-                packages, is_array = parsed.roots.packages, kind == "activity"
-                if wrong := misfit(type_name, path, packages, wants_array=is_array):
-                    yield element.value["field"].problem(*wrong)
+        path, type_name = panel.string("field"), types.get(panel.string("output") or "", "")
+        if kind != "activity" or not path or not normalised(type_name):
+            continue
+        if wrong := misfit(type_name, path, parsed.roots.packages):
+            yield panel.value["field"].problem(*wrong)
+
+
+def panels_without_effect(parsed: ParsedProject) -> Iterator[Problem]:
+    """Panels of earlier versions, which the page leaves out."""
+    dashboard = parsed.root.member("dashboard")
+    for panel in () if dashboard is None else dashboard.items("panels"):
+        if panel.string("panel") == "series":
+            text = "the panel 'series' has no effect"
+            yield panel.problem(text, "plot numbers with --viewer foxglove")
 
 
 _ALL_KEYS = {key for needed, allowed in _KEYS.values() for key in (*needed, *allowed)}

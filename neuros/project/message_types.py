@@ -325,18 +325,15 @@ def parts_of_type(text: str) -> tuple[bool, str, str]:
     return bool(found[1]), found[2], found[3] or ""
 
 
-def misfit(
-    type_name: str, path: str, packages: MessagePackages, *, wants_array: bool
-) -> tuple[str, str] | None:
-    """The problem with the path of a field, and a hint; ``None`` if it is right, or may be.
+def misfit(type_name: str, path: str, packages: MessagePackages) -> tuple[str, str] | None:
+    """The problem with the path of an array of numbers, and a hint; ``None`` if it may be right.
 
     Args:
-        type_name: of the message, as ``sensor_msgs/msg/Imu``.
-        path: as ``angular_velocity.z`` or ``ranges[0]``.
-        wants_array: whether the path must lead to an array of numbers, in place of a number.
+        type_name: of the message, as ``sensor_msgs/msg/LaserScan``.
+        path: as ``ranges`` or ``joints[0].effort``.
     """
     if not _PATH.fullmatch(path):
-        return f"'{path}' is not the path of a field", "write it as 'angular_velocity.z'"
+        return f"'{path}' is not the path of a field", "write it as 'joints[0].effort'"
     here, done = MessageField(ros_type(type_name), is_array=False), ""
     for name, place in _STEP.findall(path):
         if place:
@@ -355,11 +352,10 @@ def misfit(
             meant = did_you_mean(name, fields)
             return f"{here.type} has no field '{name}'", f"{meant} {has}".strip()
         here, done = fields[name], f"{done}.{name}".lstrip(".")
-    if here.has_numbers and here.is_array == wants_array:
+    if here.has_numbers and here.is_array:
         return None
-    wanted = "an array of numbers" if wants_array else "a number"
     hint = f"name an element, as '{done}[0]'" if here.is_array else ""
     if here.is_message:
         parts = fields_of(here.type, packages) or {}
         hint = f"name one of its fields: {listed(f'{done}.{each}' for each in parts)}"
-    return f"'{path}' of {type_name} is {here}, not {wanted}", hint
+    return f"'{path}' of {type_name} is {here}, not an array of numbers", hint

@@ -13,7 +13,6 @@ from typing import Any
 
 _MOST_WAITING = 100
 _FLAGS = ("all", "image", "spikes", "frames", "contacts")
-_LISTS = ("fields", "arrays")
 
 Wanted = Mapping[str, Mapping[str, Mapping[str, Any]]]
 """By node and port, the parts to sample (see :class:`neuros.node.sampling.Sampler`)."""
@@ -24,7 +23,7 @@ def wanted_of(asked: Any) -> Wanted:
     return {
         str(node): {
             str(port): {
-                **{key: [str(path) for path in each.get(key, ())] for key in _LISTS},
+                "arrays": [str(path) for path in each.get("arrays", ())],
                 **{flag: bool(each.get(flag)) for flag in _FLAGS},
             }
             for port, each in ports.items()
@@ -117,9 +116,8 @@ class Pages:
             for node, ports in page.wanted.items():
                 for port, each in ports.items():
                     into = merged.setdefault(node, {}).setdefault(port, {})
-                    for key in _LISTS:
-                        both = [*into.get(key, ()), *each.get(key, ())]
-                        into[key] = list(dict.fromkeys(both))
+                    both = [*into.get("arrays", ()), *each["arrays"]]
+                    into["arrays"] = list(dict.fromkeys(both))
                     for flag in _FLAGS:
                         into[flag] = bool(into.get(flag) or each.get(flag))
         return merged

@@ -87,7 +87,7 @@ def server() -> Iterator[Server]:
         {"page": "1"},
         {"page": "1", "wanted": 3},
         {"page": "1", "wanted": {"a": {"o": 5}}},
-        {"page": "1", "wanted": {"a": {"o": {"fields": 5}}}},
+        {"page": "1", "wanted": {"a": {"o": {"arrays": 5}}}},
     ],
 )
 def test_a_question_that_is_none_is_refused(server: Server, body: Any) -> None:

@@ -45,13 +45,13 @@ def test_fields_of_the_project_s_own_messages_are_checked_before_they_are_built(
         '<description>d</description><maintainer email="a@b.org">a</maintainer>'
         "<license>MIT</license><depend>geometry_msgs</depend><depend>std_msgs</depend></package>"
     )
-    (package / "msg" / "Joint.msg").write_text("float64 angle  # rad\n")
+    (package / "msg" / "Joint.msg").write_text("float64[] angles  # rad\n")
     (package / "msg" / "Arm.msg").write_text(
         "uint8 OPEN = 1\nstd_msgs/Header header\nJoint[<=7] joints\ngeometry_msgs/Point tip\n"
         "float32[3] load\nstring<=8 state ready\n"
     )
-    fields = ["joints[0].angle", "tip.x", "load[1]", "header.stamp.sec", "joint", "OPEN", "state"]
-    panel = {"panel": "series", "fields": [{"output": "arm.state", "field": f} for f in fields]}
+    fields = ["joints[0].angles", "load", "joint", "OPEN", "state"]
+    panels = [{"panel": "activity", "output": "arm.state", "field": field} for field in fields]
     arm = {
         "name": "arm",
         "container": "neuros_python",
@@ -61,13 +61,27 @@ def test_fields_of_the_project_s_own_messages_are_checked_before_they_are_built(
     (tmp_path / "arm.py").touch()
     project = tmp_path / "project.json"
     project.write_text(
-        json.dumps({"nodes": [arm], "connections": [], "dashboard": {"panels": [panel]}})
+        json.dumps({"nodes": [arm], "connections": [], "dashboard": {"panels": panels}})
     )
     with pytest.raises(ProjectError) as error:
         load_with_messages(project, reads_plugins=False)
     has = "it has 'header', 'joints', 'tip', 'load', 'state'"
     assert [(p.pointer[-7:], p.text, p.hint) for p in error.value.problems] == [
-        ("4/field", "arm_msgs/msg/Arm has no field 'joint'", f"did you mean 'joints'? {has}"),
-        ("5/field", "arm_msgs/msg/Arm has no field 'OPEN'", has),
-        ("6/field", "'state' of arm_msgs/msg/Arm is string, not a number", ""),
+        ("2/field", "arm_msgs/msg/Arm has no field 'joint'", f"did you mean 'joints'? {has}"),
+        ("3/field", "arm_msgs/msg/Arm has no field 'OPEN'", has),
+        ("4/field", "'state' of arm_msgs/msg/Arm is string, not an array of numbers", ""),
     ]
+
+
+def test_a_panel_of_earlier_versions_is_left_out_with_a_warning(tmp_path: Path) -> None:
+    panel = {"panel": "series", "fields": [{"output": "ring.rates", "field": "data[0]"}]}
+    for name in ("ring.py", "eyes.py"):
+        (tmp_path / name).write_text((RING / name).read_text())
+    told = json.loads((RING / "project.json").read_text()) | {"dashboard": {"panels": [panel]}}
+    (tmp_path / "project.json").write_text(json.dumps(told))
+    (warning,) = load_project(tmp_path, workspace=tmp_path).warnings
+    assert (warning.pointer, warning.text, warning.hint) == (
+        "/dashboard/panels/0",
+        "the panel 'series' has no effect",
+        "plot numbers with --viewer foxglove",
+    )

@@ -5,10 +5,9 @@ import {LEAST_RING} from "./activity.js";
 import {wantAllOf} from "./wants.js";
 
 export class Details {
-  constructor(plan, series, onArray) {
+  constructor(plan, onArray) {
     this.plan = plan;
     this.onArray = onArray;
-    this.series = series;
     this.title = document.querySelector("#details-title");
     this.box = document.querySelector("#details");
     this.source = null;
@@ -64,8 +63,8 @@ export class Details {
       const isNumber = typeof value !== "string";
       if (!this.rows.has(path)) {
         const {cells: [cell]} = this.row(path);
-        cell.append(isNumber ? this.button(name, path) : path);
-        // What has an element 0 that is a number is an array of numbers; a few are better plotted.
+        cell.append(path);
+        // What has an element 0 that is a number is an array of numbers; a few are better read.
         const array = path.endsWith(".length") ? path.slice(0, -".length".length) : null;
         if (array && value >= LEAST_RING && `${array}[0]` in sample.all) {
           cell.append(" ", element("button", {class: "field", title: `draw ${array} as a heat map`,
@@ -79,14 +78,5 @@ export class Details {
   row(name) {
     if (!this.rows.has(name)) this.rows.set(name, new Row(this.body, name, ["", "number"]));
     return this.rows.get(name);
-  }
-
-  button(source, path) {
-    const button = element("button", {class: "field", title: "plot this"}, path);
-    if (this.series.has(source, path)) button.classList.add("chosen");
-    button.addEventListener("click", () => {
-      button.classList.toggle("chosen", this.series.toggle(source, path));
-    });
-    return button;
   }
 }

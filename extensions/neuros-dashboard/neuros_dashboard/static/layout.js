@@ -10,7 +10,7 @@ const WIDTHS = ["narrow", "wide", "full"]; // one, two and three thirds of the p
 const RASTERS_AT_FIRST = 2;
 const AT_FIRST = [
   ["world", "full"], ["graph", "wide"], ["details", "narrow"], ["connections", "wide"],
-  ["nodes", "narrow"], ["series", "full"], ["images", "full"], ["log", "wide"],
+  ["nodes", "narrow"], ["images", "full"], ["log", "wide"],
   ["load", "narrow"],
 ];
 
@@ -91,7 +91,8 @@ export class Layout {
   // Show these panels, and no others.
   use(panels) {
     for (const panel of this.panels) panel.content?.remove();
-    this.panels = panels.map((keys) => ({...keys}));
+    this.panels = panels.filter(({panel}) => this.sections.has(panel) || OUTPUT_PANELS[panel])
+      .map((keys) => ({...keys}));
     for (const panel of this.panels) this.contents[panel.panel]?.choose(panel);
     this.arrange();
     this.note();

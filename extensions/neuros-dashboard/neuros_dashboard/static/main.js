@@ -7,7 +7,6 @@ import {Images} from "./images.js";
 import {Layout} from "./layout.js";
 import {showLoad} from "./load.js";
 import {Log} from "./log.js";
-import {Series} from "./series.js";
 import {Tables} from "./tables.js";
 import * as wants from "./wants.js";
 import {Worlds} from "./worlds.js";
@@ -22,22 +21,21 @@ const handlers = {
   begin(plan) {
     log.clear();
     wants.begin(plan.page, plan.sources, plan.nodes.filter((node) => node.is_here));
-    if (view) return view.layout.forget(); // the same run, seen again: charts and selection stay
+    if (view) return view.layout.forget(); // the same run, seen again: layout and selection stay
     document.title = `${plan.project} – NeuROS`;
     document.querySelector("#project").textContent = plan.project;
-    const series = new Series();
     const images = new Images(plan.sources);
-    const details = new Details(plan, series, (...array) => layout.draw(...array));
+    const details = new Details(plan, (...array) => layout.draw(...array));
     const select = (kind, name) => { details.select(kind, name); view.tables.select(name); };
     view = {
-      plan, series, details,
+      plan, details,
       graph: new Graph(document.querySelector("#graph"), plan, select),
       tables: new Tables(plan, select),
       images,
       worlds: new Worlds(),
     };
-    const layout = view.layout = new Layout(plan, {series, images});
-    series.onChange = images.onChange = () => layout.remember();
+    const layout = view.layout = new Layout(plan, {images});
+    images.onChange = () => layout.remember();
     window.neuros = view; // for the console of the browser
   },
   figures(figures) {
@@ -50,7 +48,6 @@ const handlers = {
   samples(samples) {
     for (const [name, sample] of Object.entries(samples)) {
       view.details.showSample(name, sample);
-      view.series.show(name, sample);
       view.images.show(name, sample);
       view.worlds.show(name, sample);
       view.layout.show(name, sample);

@@ -2,7 +2,7 @@
 
 export const WORLD = "#world"; // in place of a port: the simulated world of a node, if it has one
 
-// "node.port" -> {node, port, fields: Set, all, image; of a world: frames, contacts;
+// "node.port" -> {node, port, all, image; of a world: frames, contacts;
 // claims: by panel, {spikes: true} or {array: path}}
 const wanted = new Map();
 let page = null;
@@ -14,14 +14,14 @@ export function begin(name, sources, nodes) {
     const before = wanted.get(source.name);
     wanted.set(source.name, {
       node: source.node, port: source.port,
-      fields: before ? before.fields : new Set(), all: before ? before.all : false,
+      all: before ? before.all : false,
       image: before ? before.image : false,
       claims: before ? before.claims : new Map(),
     });
   }
   for (const {name: node} of nodes) {
     const name = `${node}.${WORLD}`;
-    wanted.set(name, wanted.get(name) ?? {node, port: WORLD, fields: new Set(), claims: new Map()});
+    wanted.set(name, wanted.get(name) ?? {node, port: WORLD, claims: new Map()});
   }
   tell();
 }
@@ -44,14 +44,12 @@ function tell() {
   const asked = {};
   for (const entry of wanted.values()) {
     const {claims, ...rest} = entry;
-    const isAsked = entry.fields.size || entry.all || entry.image || claims.size;
+    const isAsked = entry.all || entry.image || claims.size;
     if (!isAsked && entry.port !== WORLD) continue;
     const arrays = [...claims.values()].map((claim) => claim.array).filter(Boolean);
     const spikes = [...claims.values()].some((claim) => claim.spikes);
     asked[entry.node] ??= {};
-    asked[entry.node][entry.port] = {
-      ...rest, fields: [...entry.fields], arrays, spikes,
-    };
+    asked[entry.node][entry.port] = {...rest, arrays, spikes};
   }
   if (page !== null) {
     fetch("want", {method: "POST", body: JSON.stringify({page, wanted: asked})}).catch(() => {});
