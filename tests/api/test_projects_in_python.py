@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
 import json
 import json.decoder
 import math
@@ -639,6 +640,38 @@ def test_the_three_ways_of_the_page_are_the_project_of_the_readme(
     assert ports[0] == ports[1] == ports[2]
     assert plugin.partition("@")[2].strip() in in_python, "the functions are the same"
     assert launched.run(check=True).reason in out
+
+
+RUNTIME = {"neuros.engine.engine", "neuros.node.node"}
+
+
+@neuros_function(inputs="heard")
+def called_by(node: neuros.NodeHandle, heard: Any) -> None:
+    """Which modules have called this hook."""
+    frame, modules = inspect.currentframe(), set()
+    while frame is not None:
+        modules.add(frame.f_globals["__name__"])
+        frame = frame.f_back
+    (node.run_dir / "called_by.json").write_text(json.dumps(sorted(modules)))
+    node.shutdown("that is enough")
+
+
+@RUNS
+def test_launched_held_and_harnessed_hooks_are_called_by_the_same_runtime(tmp_path: Path) -> None:
+    project = talk(begin, called_by)
+    file = project.to_json("talk")
+    launched = launch(file, "--backend", "in-process", cwd=tmp_path)
+    assert launched.exit_code == 0
+    with project.session(backend="local") as s:
+        s.step()
+    harness = PluginHarness(
+        [called_by], name="bob", inputs=HEARD["inputs"], run_folder=tmp_path / "harness"
+    )
+    harness.send("heard", Int32(data=0))
+    harness.run()
+    for folder in (launched.run_folder / "bob", s.folder / "bob", tmp_path / "harness" / "bob"):
+        called_by_modules = json.loads((folder / "called_by.json").read_text())
+        assert set(called_by_modules) >= RUNTIME, called_by_modules
 
 
 def _blocks(text: str, language: str) -> list[str]:
