@@ -78,6 +78,7 @@ BY_NAME = {
         "runtime/test_local_loop.py::test_a_free_run_serves_ros",
         "runtime/test_local_loop.py::test_events_timers_and_threads",
         "runtime/test_virtual_time.py",
+        "simulators/test_mujoco_noise.py::test_one_seed",
         "upgrades/test_upgrades.py",
     ),
     "process": (

@@ -47,7 +47,7 @@ class _Form(NamedTuple):
 
 def _put_field(packet: Packet, values: Vector, sensor: Reading) -> None:
     set_vector(packet.magnetic_field, values)
-    packet.magnetic_field_covariance[::4] = sensor.noise**2
+    packet.magnetic_field_covariance[::4] = sensor.deviation**2
 
 
 def _put_range(packet: Packet, values: Vector, sensor: Reading) -> None:
@@ -83,11 +83,11 @@ class Reading(Sensor):
 
     Units and axes are MuJoCo's; ``gyro`` and the like measure along the axes of their site.
     ``force`` and ``torque`` fill their half of a WrenchStamped: the load of a child on its parent.
-    A Float64MultiArray, or an array, holds any sensor. No noise is added.
+    A Float64MultiArray, or an array, holds any sensor. MuJoCo adds no noise.
 
     Attributes:
         kinds: MuJoCo's kind of each sensor, as ``"gyro"``.
-        noise, cutoff: of the first sensor.
+        deviation, cutoff: of the first sensor; the deviation is its ``noise``.
     """
 
     kind = "reading"
@@ -105,7 +105,7 @@ class Reading(Sensor):
             mujoco.mjtSensor(int(model.sensor_type[i])).name.removeprefix("mjSENS_").lower()
             for i in indices
         ]
-        self.noise = float(model.sensor_noise[indices[0]])
+        self.deviation = float(model.sensor_noise[indices[0]])
         self.cutoff = float(model.sensor_cutoff[indices[0]])
         self._frame = self._frame_of(indices[0])
         self._form = _FORMS.get(self.declared.type)

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import mujoco
 import numpy as np
+import numpy.typing as npt
 
 from neuros.ports import Packet
 from neuros.project.message_types import ArrayType, array_type
@@ -50,6 +51,7 @@ def pixels(default: int) -> Key:
 
 
 PICTURE: Mapping[str, Key] = MappingProxyType({"width": pixels(640), "height": pixels(480)})
+DEVIATION = Key(0.0, "a standard deviation, 0 or more", least=0.0)
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,39 @@ class SensorDeclaration:
         return int(self.options["height"])
 
 
+class Noise:
+    """White noise and a drifting bias (a random walk) of one sensor, in the units of its numbers.
+
+    Each sensor draws from a stream of its own, which follows from the seed of the node and the name
+    of the output. It goes on where entities come and go, and begins anew at a reset.
+
+    Attributes:
+        deviation: standard deviation of the white noise of a reading, key ``noise``.
+        is_on: whether there is any.
+    """
+
+    def __init__(self, declared: SensorDeclaration) -> None:
+        self.deviation = declared.options.get("noise", 0.0)
+        # The bias of a firing differs from that of the one before, which is 1 / rate older.
+        self._drift = declared.options.get("bias_drift", 0.0) / math.sqrt(declared.rate_hz)
+        self.is_on = bool(self.deviation or self._drift)
+        self._output = declared.output
+
+    def begin(self, seed: int) -> None:
+        """Begin anew, with a bias of 0."""
+        self._generator = np.random.default_rng([seed, *self._output.encode()])
+        self._bias: Any = 0.0
+
+    def of(self, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+        """Values as measured, with noise; called once for each firing."""
+        values = np.asarray(values, np.float64)
+        white = self._generator.standard_normal(values.shape)
+        if self._drift:
+            self._bias += self._drift * self._generator.standard_normal(values.shape)
+        noisy: npt.NDArray[np.float64] = values + self._bias + self.deviation * white
+        return noisy
+
+
 class Sensor:
     """A sensor behind an output, bound to a model; one subclass for each kind.
 
@@ -98,6 +133,7 @@ class Sensor:
             ``mj_forward``.
         declared: the declaration.
         is_array: whether its packets are arrays.
+        noise: its noise; a kind with keys for noise adds it.
         elements: sort and id of each element that it names.
     """
 
@@ -112,9 +148,14 @@ class Sensor:
     needs_forward = True
 
     def __init__(
-        self, declared: SensorDeclaration, model: Any, cameras: Cameras, problems: Problems
+        self,
+        declared: SensorDeclaration,
+        model: Any,
+        cameras: Cameras,
+        noise: Noise,
+        problems: Problems,
     ) -> None:
-        self.declared, self.model, self.cameras = declared, model, cameras
+        self.declared, self.model, self.cameras, self.noise = declared, model, cameras, noise
         self.is_array = declared.array is not None
         found = [self.find(name, problems) for name in declared.elements]
         self.elements = [element for element in found if element]

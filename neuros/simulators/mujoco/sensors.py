@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from neuros.ports import Packet
 from neuros.project.model import Node, Port
+from neuros.project.timing import seeds
 from neuros.project.validate import SCHEMA_FOLDER, schema
 from neuros.simulators.mujoco.cameras import Cameras
 from neuros.simulators.mujoco.lookup import (
@@ -38,10 +39,12 @@ from neuros.simulators.mujoco.lookup import (
 )
 from neuros.simulators.mujoco.readings import Data, Reading, Transforms
 from neuros.simulators.mujoco.sensor_base import (
+    DEVIATION,
     PICTURE,
     WORLD_FRAME,
     Frame,
     Key,
+    Noise,
     Sensor,
     SensorDeclaration,
     Vector,
@@ -125,14 +128,18 @@ class Imu(Sensor):
     """An IMU at a site or body, in its frame, as in REP 145.
 
     ``linear_acceleration`` (m/s^2) includes gravity: +9.81 upwards at rest, 0 in free fall.
-    ``angular_velocity`` in rad/s; ``orientation`` of the element in the world. Covariances: the
-    square of ``noise`` of the model's own sensor on the diagonal, else zeros ("unknown"). Neither
-    MuJoCo nor NeuROS adds noise to readings.
+    ``angular_velocity`` in rad/s, with the declared ``noise`` (rad/s) and a bias that drifts by
+    ``bias_drift`` (rad/s per square root of a second); ``orientation`` of the element in the world.
+    Covariances: the square of the declared ``noise``, and of that of the model's own sensor, which
+    MuJoCo does not add to readings, on the diagonal; else zeros ("unknown").
     """
 
     kind = "imu"
     types = ("sensor_msgs/msg/Imu",)
     sorts = ("site", "body")
+    keys: ClassVar[Mapping[str, Key]] = MappingProxyType(
+        {"noise": DEVIATION, "bias_drift": DEVIATION}
+    )
 
     def bind(self, problems: Problems) -> None:
         self._place = place = Frame(self.model, *self.elements[0])
@@ -148,11 +155,14 @@ class Imu(Sensor):
         velocity = gyro.read(data) if gyro else place.angular_velocity(data)
         acceleration = accelerometer.read(data) if accelerometer else place.acceleration(data)
         attitude = orientation.read(data) if orientation else place.orientation(data)
+        if self.noise.is_on:
+            velocity = listed(self.noise.of(velocity))
         set_vector(packet.angular_velocity, velocity)
         set_vector(packet.linear_acceleration, acceleration)
         set_quaternion(packet.orientation, attitude)
-        if gyro:
-            packet.angular_velocity_covariance[::4] = gyro.variance
+        variance = self.noise.deviation**2 + (gyro.variance if gyro else 0.0)
+        if variance:
+            packet.angular_velocity_covariance[::4] = variance
         if accelerometer:
             packet.linear_acceleration_covariance[::4] = accelerometer.variance
         if orientation:
@@ -415,12 +425,15 @@ class Depth(_Pinhole):
 
 
 class Camera(Sensor):
-    """A camera of the model, rgb8; into an array: rows, columns and the three colours."""
+    """A camera of the model, rgb8; into an array: rows, columns and the three colours.
+
+    Each colour of each pixel has noise of its own, ``noise`` of 255 grey levels.
+    """
 
     kind = "camera"
     types = ("sensor_msgs/msg/Image", "uint8[...]")
     sorts = ("camera",)
-    keys = PICTURE
+    keys: ClassVar[Mapping[str, Key]] = MappingProxyType({**PICTURE, "noise": DEVIATION})
     axes = ("height", "width")
     is_rendered = True
 
@@ -429,6 +442,8 @@ class Camera(Sensor):
 
     def fill_array(self, packet: Packet, data: Any) -> None:
         self.cameras.render(data, self.elements[0][1], packet)
+        if self.noise.is_on:
+            packet[:] = np.rint(np.clip(self.noise.of(packet), 0, 255))
 
     def fill(self, packet: Packet, data: Any, time_ns: int) -> None:
         width, height = self.declared.width, self.declared.height
@@ -438,7 +453,7 @@ class Camera(Sensor):
         # rclpy checks lists and bytes element by element, but not arrays.
         pixels = array("B", (0,)) * (3 * width * height)
         image = np.frombuffer(pixels, np.uint8).reshape(height, width, 3)
-        self.cameras.render(data, self.elements[0][1], image)
+        self.fill_array(image, data)
         packet.data = pixels
 
 
@@ -468,14 +483,14 @@ SENSORS: Mapping[str, type[Sensor]] = {
 def read_sensors(node: Node, problems: Problems) -> tuple[SensorDeclaration, ...]:
     """The sensors that the outputs of ``node`` declare; faulty ones are left out and reported."""
     found = (
-        _sensor(port, f"{node.pointer}/outputs/{index}/mujoco", problems)
+        _sensor(node, port, f"{node.pointer}/outputs/{index}/mujoco", problems)
         for index, port in enumerate(node.outputs)
         if port.mujoco
     )
     return tuple(sensor for sensor in found if sensor)
 
 
-def _sensor(port: Port, pointer: str, problems: Problems) -> SensorDeclaration | None:
+def _sensor(node: Node, port: Port, pointer: str, problems: Problems) -> SensorDeclaration | None:
     faults, name = Faults(pointer, problems), port.mujoco.get("sensor")
     sensor = SENSORS.get(name) if isinstance(name, str) else None
     if sensor is None:
@@ -494,9 +509,14 @@ def _sensor(port: Port, pointer: str, problems: Problems) -> SensorDeclaration |
     defaults = {key: sensor.keys[key].default for key in sensor.keys}
     defaults |= dict(zip(sensor.axes, shape, strict=False))
     options = {key: port.mujoco.get(key, defaults[key]) for key in sensor.keys}
+    number = len(seeds([node]).get(node.name, {}))
     for key, value in options.items():
         if not sensor.keys[key].holds(value):
             faults.add(key, f"{value!r} is not {sensor.keys[key].what}")
+        elif value and sensor.keys[key] is DEVIATION and number != 1:
+            has = "several" if number else "none"
+            text = "noise needs a seed: one variable with SEED in its name in the environment"
+            faults.add(key, f"{text} of node '{node.name}', which has {has}")
     if faults.found:
         return None
     return SensorDeclaration(
@@ -524,10 +544,17 @@ def _elements(port: Port, sensor: type[Sensor], faults: Faults) -> tuple[str, ..
 
 
 def bind_sensors(
-    model: Any, declared: Iterable[SensorDeclaration], cameras: Cameras, problems: Problems
+    model: Any,
+    declared: Iterable[SensorDeclaration],
+    cameras: Cameras,
+    noises: Mapping[str, Noise],
+    problems: Problems,
 ) -> dict[str, Sensor]:
     """The sensor behind each output; problems are reported."""
-    return {each.output: SENSORS[each.kind](each, model, cameras, problems) for each in declared}
+    return {
+        each.output: SENSORS[each.kind](each, model, cameras, noises[each.output], problems)
+        for each in declared
+    }
 
 
 # ---- schema

@@ -23,7 +23,7 @@ from neuros.registry import MODELS
 from neuros.simulators.mujoco.cameras import Cameras, import_opengl
 from neuros.simulators.mujoco.commands import Command, add_drives, bind_commands, read_commands
 from neuros.simulators.mujoco.lookup import Problems, did_you_mean, has_any, names_of
-from neuros.simulators.mujoco.sensor_base import Sensor
+from neuros.simulators.mujoco.sensor_base import Noise, Sensor
 from neuros.simulators.mujoco.sensors import SENSORS, bind_sensors, read_sensors
 from neuros.simulators.mujoco.timing import FiringSchedule, Timebase
 
@@ -76,6 +76,7 @@ class Declared:
             problems.add_text(str(error))
             problems.raise_any()
         self.cameras = Cameras(self.model, fine=fine)
+        self._noises = {each.output: Noise(each) for each in self._sensors}
         self.time = Timebase(self.model.opt.timestep)
         periods = {}
         for sensor in self._sensors:
@@ -104,7 +105,7 @@ class Declared:
         commands = [command for command in self._commands if can_be_bound(command.actuators)]
         is_complete = len(sensors) == len(self._sensors) and len(commands) == len(self._commands)
         return _Bound(
-            bind_sensors(model, sensors, self.cameras, problems),
+            bind_sensors(model, sensors, self.cameras, self._noises, problems),
             bind_commands(model, commands, problems),
             is_complete,
         )
@@ -134,12 +135,9 @@ class World(Declared):
         self._no_warnings = bytes(self._warnings.nbytes)
         if any(SENSORS[sensor.kind].is_rendered for sensor in self._sensors):
             import_opengl()  # raises now, not at the first image
-        self.steps, self.time_s = 0, 0.0
         self._seen_warnings: set[int] = set()
         self._fields = ModelFields(self.where)
-        self._fields.apply(self.model)
-        mujoco.mj_resetData(self.model, self.data)
-        forward(self.model, self.data)
+        self.reset()
 
     def require_bound(self) -> None:
         """Raise ``ModelError`` if a declaration names an element that has never been spawned."""
@@ -178,11 +176,17 @@ class World(Declared):
         return packets
 
     def reset(self) -> None:
-        """Back to time zero and the model's initial state; spawned entities stay."""
+        """Back to time zero and the model's initial state; spawned entities stay.
+
+        Noise begins anew, by the seed of now.
+        """
         self._fields.apply(self.model)
         mujoco.mj_resetData(self.model, self.data)
         forward(self.model, self.data)
         self.steps, self.time_s = 0, 0.0
+        for noise in self._noises.values():
+            if noise.is_on:
+                noise.begin(self._node.seeds[0])
 
     def check_fields(self, variables: Mapping[str, str]) -> None:
         """Check the fields of the model that a fork will change. Raises ``ModelError``."""
