@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Vector3Stamped
 from sensor_msgs.msg import Image
 
 from neuros.testing import PluginHarness
@@ -156,3 +156,55 @@ def test_the_trainer_writes_weights_with_seeds_and_figures(load, tmp_path):
         assert len(weights["test_views"]) == len(weights["test_rad"]) == tested
     results = json.loads((folder / "results.json").read_text())
     assert results["places_network_rms_deg"] == figures["held_out_places"]["network"]["rms_deg"]
+
+
+def test_what_is_in_front_of_the_room_is_explained_away_by_robust_inference_alone(load, examples):
+    """Where nothing is in front, both expect to see the same."""
+    _, seen, codes = examples
+    network = load("predictive_coding").PredictiveCodingNetwork(seen.shape[1], codes.shape[1], 1)
+    learnt = np.arange(VIEWS) % 4 != 0
+    list(network.learn(seen[learnt], codes[learnt], 12))
+    clean = seen[~learnt]
+    hidden = clean.reshape(-1, 2, 12, 16, 3).copy()
+    hidden[:, :, :, 5:9] = 3.0  # a bright bar over a quarter of each eye
+    hidden = hidden.reshape(clean.shape)
+
+    def missed(views, robust):
+        _, _, expected = network.causes(views, robust=robust)
+        return np.mean(np.square(clean - expected))
+
+    assert missed(hidden, True) < missed(hidden, False) / 2
+    assert missed(clean, True) < 2 * missed(clean, False)
+
+
+def estimate(heading_rad: float, stamp_s: int) -> Vector3Stamped:
+    told = Vector3Stamped()
+    told.header.stamp.sec, told.vector.z = stamp_s, heading_rad
+    return told
+
+
+@pytest.mark.parametrize("late", [0, 7], ids=["in step", "the ring is late"])
+def test_a_robot_learns_the_headings_that_its_ring_tells_wrong_as_they_are(tmp_path, late):
+    """The network beside it, which learns the true ones, is right."""
+    environment = {"VIEWS": "90", "EPOCHS": "12", "SEED": "3"}
+    with PluginHarness.from_project(
+        EXAMPLE / "own_labels.json", "trainer", environment=environment, run_folder=tmp_path
+    ) as trainer:
+        headings = np.linspace(-3.1, 3.1, 90)
+        for index in range(90 + late):
+            if index < 90:
+                place = (0.4, 0.2) if index % 3 == 0 else (0.0, 0.0)
+                pose = label(headings[index], *place)
+                pose.header.stamp.sec = index
+                trainer.send("left_eye", picture(headings[index]))
+                trainer.send("right_eye", picture(headings[index] + 0.6))
+                trainer.send("label", pose)
+            if index >= late:
+                trainer.send("estimate", estimate(headings[index - late] + 0.2, index - late))
+        trainer.run()
+        assert trainer.shutdown_reason == "90 views learnt"
+        folder = trainer.run_dir
+    results = json.loads((folder / "results.json").read_text())
+    assert results["labels_rms_deg"] == pytest.approx(math.degrees(0.2), abs=0.01)
+    assert results["places_network_rms_deg"] == pytest.approx(math.degrees(0.2), rel=0.25)
+    assert results["places_truth_rms_deg"] < results["places_network_rms_deg"] / 2

@@ -35,6 +35,8 @@ DECAY = np.float32(0.01)  # pulls the uppermost causes to 0
 START = 0.1  # causes before inference
 CODE_WEIGHT = np.float32(0.3)  # of the heading's error against the view's, while learning
 LEARNING_STEPS, INFERENCE_STEPS = 30, 60
+OUTLIER = np.float32(3 * 1.4826)  # three standard deviations, of errors that are mostly Gaussian
+WIDTH_STEPS = 10  # after which the width of the errors of a view is taken anew
 READING_PENALTY = 0.03  # on the weights by which the heading is read off
 BATCH = 24
 LEARNING_RATES = (2e-3, 2e-4)  # first and last epoch, geometric in between
@@ -86,7 +88,7 @@ class PredictiveCodingNetwork:
         """
         self._mean = views.mean(axis=0)
         views = views - self._mean
-        adam = _Adam([*self._down, self._code])
+        adam = Adam([*self._down, self._code])
         first, last = rates
         for epoch in range(epochs):
             rate = first * (last / first) ** (epoch / max(1, epochs - 1))
@@ -108,14 +110,27 @@ class PredictiveCodingNetwork:
     def infer(self, views: Floats) -> tuple[Floats, Floats, Floats]:
         """Codes ``(n, codes)`` of views ``(n, pixels)``, errors ``(n, 3)``, and predicted views.
 
+        The errors and the predicted views are those of :meth:`causes`.
+        """
+        readable, errors, predicted = self.causes(views)
+        return readable @ self._read, errors, predicted
+
+    def causes(self, views: Floats, robust: bool = False) -> tuple[Floats, Floats, Floats]:
+        """What the heading is read off ``(n, 561)``, errors ``(n, 3)``, and predicted views.
+
         The errors are the mean squared ones of the view and of the two layers above it: how well
         the network knows what it sees. The first is large for what it never saw. The predicted
         views ``(n, pixels)`` are what it expects to see for the causes that it infers.
+
+        Args:
+            views: ``(n, pixels)``.
+            robust: whether pixels with errors that are large for this view count less: what is in
+                front of the room is not explained by causes of the room.
         """
-        layers = self._see(views - self._mean)
+        layers = self._see(views - self._mean, robust=robust)
         missed = self._errors(layers)
         errors = np.stack([np.mean(np.square(each), axis=1) for each in missed], axis=1)
-        return _readable(layers) @ self._read, errors, views - missed[0]
+        return _readable(layers), errors, views - missed[0]
 
     def _drawn(self, causes: int, predicted: int) -> Floats:
         drawn = self._rng.normal(0.0, 1.0 / np.sqrt(causes), (causes, predicted))
@@ -128,12 +143,23 @@ class PredictiveCodingNetwork:
             for below, above, weights in zip(layers, layers[1:], self._down, strict=False)
         ]
 
-    def _see(self, views: Floats, codes: Floats | None = None, steps: int = INFERENCE_STEPS) -> Any:
+    def _see(
+        self,
+        views: Floats,
+        codes: Floats | None = None,
+        steps: int = INFERENCE_STEPS,
+        robust: bool = False,
+    ) -> Any:
         """Descend the energy from causes that are all alike, with momentum; view and causes."""
         causes = [np.full((len(views), size), START, np.float32) for size in LAYERS]
         speeds = [np.zeros_like(cause) for cause in causes]
-        for _ in range(steps):
+        for step in range(2 * steps if robust else steps):
             errors = self._errors([views, *causes])
+            if robust and step >= steps:
+                # Student's t in the place of a Gaussian, as wide as most errors of the view are.
+                if step % WIDTH_STEPS == 0:
+                    width = OUTLIER * np.median(np.abs(errors[0]), axis=1, keepdims=True)
+                errors[0] /= 1 + np.square(errors[0] / width)
             for layer, (cause, speed) in enumerate(zip(causes, speeds, strict=True)):
                 pull = errors[layer] @ self._down[layer].T
                 if layer + 1 == len(causes) and codes is not None:
@@ -164,7 +190,7 @@ class PredictiveCodingNetwork:
         self._read = read.astype(np.float32)
 
 
-class _Adam:
+class Adam:
     """Climbs, in place; after Kingma & Ba, "Adam", ICLR (2015), with its usual constants."""
 
     def __init__(self, weights: list[Floats]) -> None:

@@ -30,11 +30,13 @@ class Examples:
 
     Attributes:
         views, headings_rad, positions_m: of each example, in order.
+        labels_rad: the headings to learn; left empty: the true ones.
     """
 
     def __init__(self, network_class=PredictiveCodingNetwork):
         self.network_class = network_class
         self.views, self.headings_rad, self.positions_m = [], [], []
+        self.labels_rad = []
 
 
 @neuros_initialise()
@@ -61,8 +63,9 @@ def train(node, examples):
     seed, epochs = int(os.environ.get("SEED", "1")), int(os.environ.get("EPOCHS", "20"))
     views = np.array(examples.views, np.float32)
     headings_rad = np.array(examples.headings_rad, np.float32)
+    labels_rad = np.array(examples.labels_rad or examples.headings_rad, np.float32)
     parts = split(headings_rad, np.array(examples.positions_m))
-    learnt_views, learnt_rad = views[parts.learnt], headings_rad[parts.learnt]
+    learnt_views, learnt_rad = views[parts.learnt], labels_rad[parts.learnt]
     codes = np.array([code_of(heading) for heading in learnt_rad])
     network = examples.network_class(PIXELS, CODES, derive_seed(seed, node.name))
     node.get_logger().info(f"learns {len(codes)} views with {network.computed_by}")
@@ -93,8 +96,9 @@ def train(node, examples):
             "median": float(np.median(errors[:, 0])) if held.any() else None,
             "p95": float(np.percentile(errors[:, 0], 95)) if held.any() else None,
         }
-        squares.extend((off_rad(told["network"], headings_rad[held]) / errors[:, 0]) ** 2)
-    # How far a heading is off grows with the prediction error of its view: see README.md.
+        squares.extend((off_rad(told["network"], labels_rad[held]) / errors[:, 0]) ** 2)
+    # How far a heading is off grows with the prediction error of its view: see README.md. A robot
+    # that has only its own labels knows no better ones.
     rad_per_error = float(np.sqrt(np.mean(squares))) if squares else math.inf
     figures["deg_per_error"] = math.degrees(rad_per_error)
     tested = parts.headings | parts.places

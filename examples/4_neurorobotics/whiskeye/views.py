@@ -26,8 +26,13 @@ def view_of(left: Any, right: Any) -> Floats:
 
     Mean 0 and standard deviation 1 over both, ``(1152,)``.
     """
-    small = _averaged(left, right)
-    return ((small - small.mean()) / (small.std() + 1e-6)).astype(np.float32)
+    return standardised(averaged(left, right))
+
+
+def standardised(small: NDArray[np.floating]) -> Floats:
+    """Mean colours ``(..., 1152)`` with mean 0 and standard deviation 1 each."""
+    mean, deviation = (f(small, axis=-1, keepdims=True) for f in (np.mean, np.std))
+    return ((small - mean) / (deviation + 1e-6)).astype(np.float32)
 
 
 def picture_of(view: Floats, left: Any, right: Any) -> NDArray[np.uint8]:
@@ -35,7 +40,7 @@ def picture_of(view: Floats, left: Any, right: Any) -> NDArray[np.uint8]:
 
     Of images of 80 x 60 pixels it is ``(60, 160, 3)``.
     """
-    small = _averaged(left, right)
+    small = averaged(left, right)
     pixels = np.clip(small.mean() + small.std() * view, 0, 255).astype(np.uint8)
     eyes = np.hstack(list(pixels.reshape(2, HEIGHT, WIDTH, 3)))
     return eyes.repeat(left.height // HEIGHT, axis=0).repeat(left.width // WIDTH, axis=1)
@@ -51,8 +56,8 @@ def heading_of(code: Floats) -> float:
     return _READ.of_rates(np.maximum(code, 0.0) ** 4).angle_rad
 
 
-def _averaged(*images: Any) -> NDArray[np.float64]:
-    """Mean colours of blocks of pixels, 16 x 12 of each image, one after the other."""
+def averaged(*images: Any) -> NDArray[np.float64]:
+    """Mean colours of blocks of pixels, 16 x 12 of each image, one after the other ``(1152,)``."""
     small = []
     for image in images:
         pixels = np.frombuffer(image.data, dtype=np.uint8)
