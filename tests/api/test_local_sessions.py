@@ -25,11 +25,11 @@ import pytest
 import rclpy
 from api_projects import ENDLESS, dice
 from cart_project import cart, port
+from deadlines import wait_until
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Float64
 
 import neuros
-from containers import wait_until
 from neuros.api.local_run import NAME
 from neuros.api.session import Session
 from neuros.errors import HookError, RunError, UsageError

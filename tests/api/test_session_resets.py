@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from api_projects import COUNTER, ENDLESS, THROWER, dice
 from cart_project import BRAIN, ROBOT, cart
+from deadlines import wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from std_msgs.msg import Float64
@@ -17,7 +18,7 @@ from test_python_api import thrown
 from test_stepped_sessions import ACCEPTANCE, DEADLINE_S, EVERY_BACK_END, poses
 
 import neuros
-from containers import require_containers, wait_until
+from containers import require_containers
 from neuros.api.live import LiveRun
 from neuros.api.session import Session
 from neuros.backends.control_sockets import connect

@@ -21,13 +21,14 @@ import psutil
 import pytest
 from api_projects import ENDLESS, THROWER, dice
 from cart_project import BRAIN, cart, port
+from deadlines import wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from std_msgs.msg import Float64, String, UInt8MultiArray
 from test_python_api import thrown
 
 import neuros
-from containers import require_containers, wait_until
+from containers import require_containers
 from neuros.api.live import LiveRun
 from neuros.api.session import Session
 from neuros.backends.control_sockets import connect

@@ -7,8 +7,6 @@ import json
 import os
 import secrets
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import neuros
 from endings import KEEP_THE_GIL, RUNS
 from launching import Running, start
 
@@ -108,16 +107,6 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "demo/plugin.py").write_text(PLUGIN)
     (tmp_path / "demo/project.json").write_text(PROJECT)
     return tmp_path
-
-
-def neuros(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "neuros.cli", *arguments],
-        capture_output=True,
-        text=True,
-        timeout=30.0,
-        check=False,
-    )
 
 
 def run_of(running: Running) -> RunOnThisMachine:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from commands import neuros
 from launching import BACKENDS, EXAMPLES, launch
 
 WHISKEYE = "4_neurorobotics/whiskeye"
@@ -41,13 +40,7 @@ def replays(options: tuple[str, ...], backend: str, folder: Path) -> None:
     command = [str(EXAMPLES / project), "--backend", backend, "-r", *others]
     run = launch(*command, cwd=folder, timeout_s=300.0)
     assert run.exit_code == 0, run.output
-    done = subprocess.run(
-        [sys.executable, "-m", "neuros.cli", "replay", str(run.run_folder)],
-        capture_output=True,
-        text=True,
-        timeout=600,
-        check=False,
-    )
+    done = neuros("replay", run.run_folder)
     assert done.returncode == 0, done.stdout + done.stderr
     assert f"\nidentical: {len(run.record['nodes'])} node" in done.stdout
     assert "as far as recorded" not in done.stdout

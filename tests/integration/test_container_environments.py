@@ -10,11 +10,10 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from deadlines import wait_until
 from launching import EXAMPLES, Finished, Running, launch, start
 from packages import make_slow_package, make_wheel
 
@@ -113,13 +112,6 @@ class Project:
 @pytest.fixture
 def project(tmp_path: Path) -> Project:
     return Project(tmp_path)
-
-
-def wait_until(condition: Callable[[], bool], timeout_s: float = 30.0) -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, "deadline passed"
-        time.sleep(0.02)
 
 
 def processes_with(text: bytes) -> list[int]:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from deadlines import wait_until
 from ending_bench import (
     COUNTS,
     ENDS,
@@ -27,8 +28,6 @@ from ending_bench import (
 )
 from endings import GONE_WITHIN_S, KEEP_THE_GIL, RUNS
 from launching import BACKENDS, REPOSITORY
-
-from containers import wait_until
 
 
 @pytest.fixture(params=BACKENDS)

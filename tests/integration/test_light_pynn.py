@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import neuros
 from launching import EXAMPLES, Finished, launch
 
 from containers import nothing_left, require_containers
@@ -34,14 +35,7 @@ def run(folder: Path, backend: str, heading_deg: int) -> Finished:
 
 def verdict(one: Finished, other: Finished) -> str:
     """What ``neuros verify`` says of two runs."""
-    command = [sys.executable, "-m", "neuros.cli", "verify"]
-    done = subprocess.run(
-        [*command, str(one.run_folder), str(other.run_folder)],
-        capture_output=True,
-        text=True,
-        timeout=TIMEOUT_S,
-        check=False,
-    )
+    done = neuros("verify", one.run_folder, other.run_folder)
     return done.stdout + done.stderr
 
 

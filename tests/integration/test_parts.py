@@ -9,9 +9,9 @@ from pathlib import Path
 
 import psutil
 import pytest
+from deadlines import wait_until
 from launching import Running, start
 
-from containers import wait_until
 from neuros.backends.domain import choose_domain
 
 STREAM = Path(__file__).parent / "network" / "stream"

@@ -11,11 +11,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import wait_until
 from launching import BACKENDS, EXAMPLES, Finished, Running, launch, start
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, make_reader
@@ -306,13 +307,6 @@ def processes_of(run: Path) -> dict[int, str]:
             if str(run) in command and int(entry.name) != os.getpid():
                 found[int(entry.name)] = command
     return found
-
-
-def wait_until(condition: Callable[[], object], timeout_s: float = 30.0) -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
 
 
 def flushed(run: Path) -> int:

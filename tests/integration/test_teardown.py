@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 
 import pytest
 import rclpy
+from deadlines import wait_until
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -34,13 +34,6 @@ def begin(name: str, domain_id: int) -> tuple[Context, Node]:
     options = SignalHandlerOptions.NO
     rclpy.init(context=context, domain_id=domain_id, signal_handler_options=options)
     return context, rclpy.create_node(name, context=context)
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.002)
 
 
 @pytest.fixture

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from deadlines import wait_until
 from virtual_display import virtual_display
 
 pytest.importorskip("matplotlib")
@@ -44,13 +45,6 @@ def coloured(file: Path, colour: tuple[float, float, float]) -> Any:
     pixels = imread(file)[..., :3]
     rows, columns = np.nonzero(np.all(np.abs(pixels - colour) < 0.15, axis=2))
     return rows / pixels.shape[0], columns / pixels.shape[1]
-
-
-def until(condition: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
 
 
 def test_the_published_names_draw_angles_that_are_broken_where_they_wrap(tmp_path: Path) -> None:
@@ -239,11 +233,11 @@ while True:
         assert node.stdout is not None
         pid = int(node.stdout.readline())
         picture = tmp_path / "speed.png"
-        until(picture.exists)
+        wait_until(picture.exists)
         first = picture.stat().st_mtime_ns
-        until(lambda: picture.stat().st_mtime_ns > first)
+        wait_until(lambda: picture.stat().st_mtime_ns > first)
         node.kill()
-    until(lambda: not Path(f"/proc/{pid}").exists() or _is_zombie(pid))
+    wait_until(lambda: not Path(f"/proc/{pid}").exists() or _is_zombie(pid))
     assert picture.stat().st_size > 1000
 
 

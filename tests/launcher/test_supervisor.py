@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import wait_until
 from supervised import SHUTS_DOWN, WELL_BEHAVED, Run, supervised, wire
 
-from containers import wait_until
 from neuros.backends.process_launchers import ProcessLauncher, RunningProcess
 from neuros.control import Begin, Message
 from neuros.control.link import ControlLink

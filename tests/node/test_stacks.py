@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import wait_until
 
-from containers import wait_until
 from neuros.stacks import ProcessThreads, Thread, stack_in, threads_of
 
 PLUGIN = """\

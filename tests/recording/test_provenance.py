@@ -9,9 +9,9 @@ from pathlib import Path
 
 import psutil
 import pytest
+from deadlines import wait_until
 from needs import require
 
-from containers import wait_until
 from neuros.project.model import Node
 from neuros.recording.provenance import (
     GitState,

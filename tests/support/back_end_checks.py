@@ -8,13 +8,13 @@ import json
 import re
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import wait_until
 
 from neuros.backends.run_processes import RunProcesses
 from neuros.backends.sessions import sessions
@@ -23,7 +23,6 @@ from neuros.distribution import python_command
 PROJECTS = Path(__file__).parents[1] / "integration" / "back_ends"
 COUNT = 200
 TIMEOUT_S = 60.0
-_LOOK_S = 0.05
 # SHA-256 of all that the sink of the project ``pipeline`` receives, by input.
 _DIGESTS = (
     "1cad2308551c756f36c3900d44a500a37e7828edb7074631f8b6c3784938923e",
@@ -81,14 +80,6 @@ def finish(process: subprocess.Popen[str], folder: Path) -> Launched:
     file = folder / "run.json"
     record = json.loads(file.read_text("utf-8")) if file.exists() else {}
     return Launched(process.returncode, output, folder, record)
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    """Until something holds; fails if it does not in time."""
-    deadline_s = time.monotonic() + TIMEOUT_S
-    while not condition():
-        assert time.monotonic() < deadline_s, f"not within {TIMEOUT_S:g} s"
-        time.sleep(_LOOK_S)
 
 
 class BackEndChecks:
@@ -331,11 +322,11 @@ class BackEndChecks:
         assert processes.alive()
         process.send_signal(signal.SIGKILL)
         finish(process, folder)
-        wait_until(lambda: not processes.alive())
-        wait_until(lambda: not any(each.run == run_id for each in sessions()))
+        wait_until(lambda: not processes.alive(), TIMEOUT_S)
+        wait_until(lambda: not any(each.run == run_id for each in sessions()), TIMEOUT_S)
 
     def _await_packets(self, folder: Path, process: subprocess.Popen[str]) -> None:
         """Until nodes run: the reader has written down a packet."""
         seen = folder / "reader" / "seen"
-        wait_until(lambda: seen.exists() or process.poll() is not None)
+        wait_until(lambda: seen.exists() or process.poll() is not None, TIMEOUT_S)
         assert process.poll() is None, process.communicate()[0]

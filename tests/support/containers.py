@@ -5,12 +5,12 @@ Without an engine, or without NeuROS's images in it, they are left out, as :mod:
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
+from deadlines import wait_until
 from docker import DockerClient
 from needs import cannot_run
 
@@ -45,15 +45,6 @@ def connected() -> Iterator[DockerClient]:
         yield engine
     finally:
         engine.close()
-
-
-def wait_until(condition: Callable[[], object], deadline_s: float = 10.0) -> float:
-    """Until it holds; returns how long that took, in seconds, and fails after the deadline."""
-    start_s = time.monotonic()
-    while not condition():
-        assert time.monotonic() - start_s < deadline_s, "deadline passed"
-        time.sleep(0.02)
-    return time.monotonic() - start_s
 
 
 @contextmanager

@@ -10,11 +10,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from deadlines import wait_until
 from docker import DockerClient
 from machines import Machine, require_machines
 from needs import cannot_run
 
-from containers import connected, require_containers, wait_until
+from containers import connected, require_containers
 from neuros.backends.docker.engine import connect
 from neuros.errors import EnvironmentFault
 

@@ -116,7 +116,6 @@ BY_NAME = {
     ),
     "slow": (
         "benchmarks/test_reproduce_headdirection.py",
-        "benchmarks/test_reproduce_tables.py",
         "documentation/test_site_parts.py::TestReference",
         "extensions/neuros-analysis/tests/test_report_command.py",
         "extensions/neuros-robots/tests/test_sdf_kinematics.py",

@@ -114,14 +114,9 @@ def write_project(folder: Path) -> Path:
 def replay(
     run: Path, name: str, *arguments: str, stdin: str = "", **environment: str
 ) -> subprocess.CompletedProcess[str]:
-    return replay_run(run, "--node", name, *arguments, stdin=stdin, **environment)
-
-
-def replay_run(
-    run: Path, *arguments: str, stdin: str = "", **environment: str
-) -> subprocess.CompletedProcess[str]:
+    """One node, in a process that the replayed plugin may do anything with."""
     return subprocess.run(
-        [sys.executable, "-m", "neuros.cli", "replay", str(run), *arguments],
+        [sys.executable, "-m", "neuros.cli", "replay", str(run), "--node", name, *arguments],
         input=stdin,
         capture_output=True,
         text=True,

@@ -6,12 +6,12 @@ import json
 import re
 import shutil
 import signal
-import subprocess
-import sys
 from pathlib import Path
+from subprocess import CompletedProcess
 from typing import Any
 
 import pytest
+from commands import neuros
 from launching import BACKENDS, Finished, launch, start
 
 ROBOT = """\
@@ -145,19 +145,16 @@ def own(run: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def neuros(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "neuros.cli", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-
-
-def fork(run: Path, output: Path, *options: object) -> subprocess.CompletedProcess[str]:
+def fork(run: Path, output: Path, *options: object) -> CompletedProcess[str]:
     return neuros("fork", run, "-o", output, *options)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_an_unchanged_fork_is_identical_to_its_end(backend: str, tmp_path: Path) -> None:
-    run = recorded(tmp_path, "--backend", backend).run_folder
-    assert run is not None
+def test_an_unchanged_fork_is_identical_to_its_end(backend: str, run: Path, tmp_path: Path) -> None:
+    if backend != "process":
+        own = recorded(tmp_path, "--backend", backend).run_folder
+        assert own is not None
+        run = own
     done = fork(run, tmp_path / "fork", "--at", "0.5sim")
     assert done.returncode == 0, done.stdout + done.stderr
     assert re.search(r"^identical up to 0\.5 s: (51|52) packets$", done.stdout, re.M), done.stdout
@@ -225,9 +222,16 @@ def test_what_users_mistype_of_virtual_time(
     assert "identical" not in done.stdout
 
 
-def test_the_record_tells_what_it_is_a_fork_of(run: Path, tmp_path: Path) -> None:
-    fork(run, tmp_path / "fork", "--at", ".3sim", "--set", "nodes.brain.environment.GAIN=3")
-    record = json.loads((tmp_path / "fork/run.json").read_text())
+@pytest.fixture(scope="module")
+def changed(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("changed") / "fork"
+    done = fork(run, folder, "--at", ".3sim", "--set", "nodes.brain.environment.GAIN=3")
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_the_record_tells_what_it_is_a_fork_of(run: Path, changed: Path) -> None:
+    record = json.loads((changed / "run.json").read_text())
     assert record["fork"] == {
         "run": str(run),
         "run_id": json.loads((run / "run.json").read_text())["run_id"],
@@ -246,11 +250,9 @@ def test_a_fork_of_a_fork(run: Path, tmp_path: Path) -> None:
 
 
 def test_a_fork_that_was_changed_cannot_be_executed_again_by_its_project(
-    run: Path, tmp_path: Path
+    changed: Path, tmp_path: Path
 ) -> None:
-    changed = ("--set", "nodes.brain.environment.GAIN=3")
-    fork(run, tmp_path / "first", "--at", "0.3sim", *changed)
-    done = fork(tmp_path / "first", tmp_path / "second", "--at", "0.6sim")
+    done = fork(changed, tmp_path / "second", "--at", "0.6sim")
     assert done.returncode == 2, done.stdout + done.stderr
     assert "it is a fork with settings itself: name the run that it began with" in done.stderr
 

@@ -8,14 +8,14 @@ import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import neuros
+from deadlines import wait_until
 from launching import BACKENDS, EXAMPLES, launch, start
-from replaying import MIXER, Recorded, copied, node, record, replay, replay_run, wire, write_project
+from replaying import MIXER, Recorded, copied, node, record, replay, wire, write_project
 
 DEADLINE_S = 120.0
 
@@ -155,9 +155,11 @@ def pair(plugin: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_every_node_of_a_lossy_and_ticking_run_is_identical(backend: str, tmp_path: Path) -> None:
-    run = record(tmp_path, backend).run
-    done = replay_run(run)
+def test_every_node_of_a_lossy_and_ticking_run_is_identical(
+    backend: str, recorded: Recorded, tmp_path: Path
+) -> None:
+    run = recorded.run if backend == "process" else record(tmp_path, backend).run
+    done = neuros("replay", run)
     assert done.returncode == 0, done.stdout + done.stderr
     figures = json.loads((run / "run.json").read_text())
     for name, row in rows(done.stdout).items():
@@ -169,7 +171,7 @@ def test_every_node_of_a_lossy_and_ticking_run_is_identical(backend: str, tmp_pa
 
 
 def test_as_many_nodes_run_at_a_time_as_are_asked_for(recorded: Recorded) -> None:
-    done = replay_run(recorded.run, "--jobs", "1")
+    done = neuros("replay", recorded.run, "--jobs", "1")
     assert done.returncode == 0, done.stdout + done.stderr
     said = [line for line in done.stderr.splitlines() if "replayed" in line]
     assert said == [
@@ -179,7 +181,7 @@ def test_as_many_nodes_run_at_a_time_as_are_asked_for(recorded: Recorded) -> Non
 
 
 def test_as_json(recorded: Recorded) -> None:
-    done = replay_run(recorded.run, "--format", "json", "--node", "mixer")
+    done = neuros("replay", recorded.run, "--format", "json", "--node", "mixer")
     assert done.returncode == 0, done.stdout + done.stderr
     answer = json.loads(done.stdout)
     (verdict,) = answer["nodes"]
@@ -209,7 +211,7 @@ def test_physics_that_runs_by_itself_is_where_the_hooks_saw_it(
     project = {"nodes": [physics, pusher], "connections": wires}
     plugins = {"physics": PHYSICS, "pusher": PUSHER}
     run = run_of(tmp_path, project, plugins, "--backend", *options.split())
-    done = replay_run(run)
+    done = neuros("replay", run)
     assert done.returncode == 0, done.stdout + done.stderr
     assert int(rows(done.stdout)["physics"][1]) > 100
 
@@ -217,7 +219,7 @@ def test_physics_that_runs_by_itself_is_where_the_hooks_saw_it(
 def test_the_time_that_a_node_is_told_is_that_of_the_run(tmp_path: Path) -> None:
     plugin = STAMPS.replace("READ", "node.now().nanosec")
     run = run_of(tmp_path, pair("stamps"), {"stamps": plugin, "listener": LISTENER})
-    done = replay_run(run)
+    done = neuros("replay", run)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -227,7 +229,7 @@ def test_the_time_that_a_node_is_told_is_that_of_the_run(tmp_path: Path) -> None
 def test_a_clock_that_the_plugin_reads_itself_is_told_by_packet(tmp_path: Path) -> None:
     plugin = STAMPS.replace("READ", "time.time_ns()")
     run = run_of(tmp_path, pair("stamps"), {"stamps": plugin, "listener": LISTENER})
-    done = replay_run(run)
+    done = neuros("replay", run)
     assert done.returncode == 1, done.stdout + done.stderr
     sender, listener = rows(done.stdout).values()
     assert sender[2] == "different"
@@ -238,7 +240,7 @@ def test_a_clock_that_the_plugin_reads_itself_is_told_by_packet(tmp_path: Path) 
 def test_a_changed_plugin_is_the_only_node_that_differs(own: Recorded) -> None:
     plugin = own.project / "mixer.py"
     plugin.write_text(MIXER.replace("seen[0] % 1000", "seen[0] % 1000 + (seen[0] > 20)"))
-    done = replay_run(own.run)
+    done = neuros("replay", own.run)
     assert done.returncode == 1, done.stdout + done.stderr
     found = rows(done.stdout)
     assert found["counter"][2:] == ["identical"]
@@ -254,7 +256,7 @@ def test_a_plugin_that_kills_its_process_is_told_with_its_last_words(own: Record
     dies = "    seen = node.get_user_data()\n    print('so long', flush=True)\n    os._exit(9)\n"
     plugin = MIXER.replace("    seen = node.get_user_data()\n", dies)
     (own.project / "mixer.py").write_text(f"import os\n{plugin}")
-    done = replay_run(own.run)
+    done = neuros("replay", own.run)
     assert done.returncode == 4, done.stdout + done.stderr
     assert "not replayed" in done.stdout
     assert "its process ended: exit code 9" in done.stdout
@@ -267,7 +269,7 @@ def test_a_plugin_that_kills_its_process_is_told_with_its_last_words(own: Record
 def test_what_cannot_be_replayed_is_refused_at_once_and_nothing_is_started(own: Recorded) -> None:
     (own.project / "mixer.py").unlink()
     (own.run / "counter/packets/event_log").unlink()
-    done = replay_run(own.run)
+    done = neuros("replay", own.run)
     assert done.returncode == 2, done.stdout + done.stderr
     assert "2 of 2 nodes of " in done.stderr
     assert "cannot be replayed, and none was started" in done.stderr
@@ -279,7 +281,7 @@ def test_what_cannot_be_replayed_is_refused_at_once_and_nothing_is_started(own: 
 
 def test_the_refusal_says_how_to_replay_the_others(own: Recorded) -> None:
     (own.project / "mixer.py").unlink()
-    done = replay_run(own.run)
+    done = neuros("replay", own.run)
     assert done.returncode == 2, done.stdout + done.stderr
     assert f"to replay the others: neuros replay {own.run} --node counter" in done.stderr
     assert replay(own.run, "counter").returncode == 0
@@ -292,7 +294,7 @@ def test_connections_that_were_left_out_are_named_for_both_ends(tmp_path: Path) 
         cwd=tmp_path,
     )
     assert finished.run_folder is not None
-    done = replay_run(finished.run_folder)
+    done = neuros("replay", finished.run_folder)
     assert done.returncode == 2
     assert "  ann: what 'ann' received on bob.ball_out -> ann.ball_in was not" in done.stderr
     assert "  bob: nothing that it sent was recorded: run the project again" in done.stderr
@@ -300,7 +302,7 @@ def test_connections_that_were_left_out_are_named_for_both_ends(tmp_path: Path) 
 
 def test_callbacks_on_the_ros_node_are_refused_by_name(tmp_path: Path) -> None:
     run = run_of(tmp_path, pair("served"), {"served": SERVED, "listener": LISTENER})
-    done = replay_run(run)
+    done = neuros("replay", run)
     assert done.returncode == 2, done.stdout + done.stderr
     assert re.search(r"  sender: \d+ callbacks of services, timers or subscriptions", done.stderr)
     assert f"to replay the others: neuros replay {run} --node listener" in done.stderr
@@ -314,7 +316,7 @@ def test_a_run_without_a_recording_says_how_to_make_one(tmp_path: Path) -> None:
     tennis = EXAMPLES / "2_synchronisation/tennis"
     finished = launch(tennis, "--backend", "process", cwd=tmp_path)
     assert finished.run_folder is not None
-    done = replay_run(finished.run_folder)
+    done = neuros("replay", finished.run_folder)
     assert done.returncode == 2
     assert "was not recorded: launch the project with -r" in done.stderr
 
@@ -332,7 +334,7 @@ def test_a_run_without_a_recording_says_how_to_make_one(tmp_path: Path) -> None:
     ],
 )
 def test_what_users_mistype(recorded: Recorded, options: list[str], says: str) -> None:
-    done = replay_run(recorded.run, *options)
+    done = neuros("replay", recorded.run, *options)
     assert done.returncode == 2, done.stdout + done.stderr
     assert says in done.stderr
     assert "Traceback" not in done.stderr
@@ -341,7 +343,7 @@ def test_what_users_mistype(recorded: Recorded, options: list[str], says: str) -
 def test_an_event_log_that_was_cut_off_is_replayed_as_far_as_it_goes(own: Recorded) -> None:
     event_log = own.run / "mixer/packets/event_log"
     event_log.write_bytes(event_log.read_bytes()[: event_log.stat().st_size // 2])
-    done = replay_run(own.run)
+    done = neuros("replay", own.run)
     assert done.returncode == 0, done.stdout + done.stderr
     found = rows(done.stdout)
     assert found["mixer"][2] == "identical, as far as recorded"
@@ -354,17 +356,19 @@ def test_a_run_that_was_killed_is_replayed_as_far_as_it_was_kept(what: str, tmp_
     project = write_project(tmp_path / "project")
     (project / "limit").write_text("1000000000")
     with start(project, "--backend", "process", "-r", cwd=tmp_path) as running:
-        wait_until(lambda: len(event_logs(tmp_path)) == 2)
+        wait_until(lambda: len(event_logs(tmp_path)) == 2, DEADLINE_S)
         (run,) = (tmp_path / "runs").glob("*/*")
-        refused = replay_run(run)
+        refused = neuros("replay", run)
         assert refused.returncode == 4, refused.stdout + refused.stderr
         assert "is still being recorded: wait for its end" in refused.stderr
         if what == "everything":
             for process in processes_of(run):
                 os.kill(process, signal.SIGKILL)
         running.signal(signal.SIGKILL)
-    wait_until(lambda: not processes_of(run))  # nodes end by themselves without a launcher
-    done = replay_run(run)
+    wait_until(
+        lambda: not processes_of(run), DEADLINE_S
+    )  # nodes end by themselves without a launcher
+    done = neuros("replay", run)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "note: the launcher of the run was killed" in done.stdout
     found = rows(done.stdout)
@@ -374,13 +378,6 @@ def test_a_run_that_was_killed_is_replayed_as_far_as_it_was_kept(what: str, tmp_
 
 def event_logs(folder: Path) -> list[Path]:
     return [*folder.glob("runs/*/*/*/packets/event_log")]
-
-
-def wait_until(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
 
 
 def processes_of(run: Path) -> list[int]:
@@ -404,7 +401,7 @@ def test_ctrl_c_ends_the_replays(own: Recorded, tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     command = [sys.executable, "-m", "neuros.cli", "replay", str(own.run), "-o", str(kept)]
     with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
-        wait_until((kept / "mixer/waits").exists)
+        wait_until((kept / "mixer/waits").exists, DEADLINE_S)
         process.send_signal(signal.SIGINT)
         assert process.wait(DEADLINE_S) == 130
     assert processes_of(kept) == []

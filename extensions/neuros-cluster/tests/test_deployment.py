@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 from back_end_checks import PROJECTS
+from deadlines import wait_until
 from ending_bench import Bench, assert_ended
 from launching import Finished, Running, killed_in_a_hook, launch, start
 from neuros_cluster.deployment_file import Host
@@ -23,7 +24,6 @@ from neuros_cluster.machine import Machine, agent_command
 from neuros_cluster.messages import Lacking, Start, ThreadsRead
 
 import neuros
-from containers import wait_until
 from neuros.backends.control_sockets import connect
 from neuros.control.link import encode
 from neuros.errors import EnvironmentFault

@@ -20,13 +20,13 @@ from pathlib import Path
 
 import psutil
 import pytest
+from deadlines import wait_until
 from engines import OwnEngine, own_engine, require_engines
 from launching import EXAMPLES, Finished, Running
 from machines import APART_S, Machine, require_machines
 from ssh_server import SshServer, ssh_server
 from two_machines import ADDRESSES, TwoMachines
 
-from containers import wait_until
 from neuros.backends.control_sockets import connect
 from neuros.backends.run_processes import RunProcesses
 from neuros.backends.sessions import RunOnThisMachine, sessions

@@ -15,11 +15,12 @@ from typing import Any
 
 import pytest
 from back_end_checks import PROJECTS
+from deadlines import wait_until
 from docker import DockerClient
 from launching import Running, killed_in_a_hook, launch, start
 from neuros_cluster.remote_engine import AGENT_LABEL
 
-from containers import connected, require_containers, wait_until
+from containers import connected, require_containers
 
 HERE = Path(__file__).parents[3] / "tests/integration"
 STREAM = HERE / "network" / "stream"
@@ -90,7 +91,10 @@ def test_nodes_run_in_containers_of_their_own(engine: DockerClient, tmp_path: Pa
         "box-sink": ["sink"],
     }
     assert machines["box-sink"]["container"]["image"].startswith("neuros_python:")
-    wait_until(lambda: not containers_of(engine, "source") + containers_of(engine, "sink"))
+    wait_until(
+        lambda: not containers_of(engine, "source") + containers_of(engine, "sink"),
+        GONE_S + SLACK_S,
+    )
 
 
 def test_it_is_said_where_a_node_stood_that_is_killed(engine: DockerClient, tmp_path: Path) -> None:
@@ -98,7 +102,7 @@ def test_it_is_said_where_a_node_stood_that_is_killed(engine: DockerClient, tmp_
     with start(PROJECTS / "stuck", "--deployment", file, cwd=tmp_path) as running:
         finished = killed_in_a_hook(running, UP_S)
     assert "in compute" in finished.record["nodes"]["reader"]["stack"], finished.output
-    wait_until(lambda: not containers_of(engine, "reader"))
+    wait_until(lambda: not containers_of(engine, "reader"), GONE_S + SLACK_S)
 
 
 def test_messages_of_the_project_come_along(engine: DockerClient, tmp_path: Path) -> None:
@@ -108,7 +112,7 @@ def test_messages_of_the_project_come_along(engine: DockerClient, tmp_path: Path
     assert finished.exit_code == 0, finished.output
     assert all(books["lost"] == 0 for books in finished.record["connections"])
     assert finished.record["machines"]["box"]["nodes"] == ["brain"]
-    wait_until(lambda: not containers_of(engine, "brain"))
+    wait_until(lambda: not containers_of(engine, "brain"), GONE_S + SLACK_S)
 
 
 def test_limits_of_a_node_hold_there(deployed: Deployed, engine: DockerClient) -> None:

@@ -12,10 +12,11 @@ from typing import Any
 
 import pytest
 import yaml
+from deadlines import wait_until
 from launching import Finished, launch
 from needs import require
 
-from containers import connected, require_containers, wait_until
+from containers import connected, require_containers
 from neuros.cli.main import main
 
 pytestmark = pytest.mark.acceptance

@@ -6,11 +6,12 @@ import fcntl
 import os
 import time
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import wait_until
 from msgspec.structs import replace
 from neuros_cluster.agent import Agent, remove_old_runs
 from neuros_cluster.deployment_file import Host
@@ -367,7 +368,7 @@ class TestPump:
         node.close()
         end = NodeEnded("eye", "exit code 0")
         ends.agent.send_last(end)
-        wait_for(lambda: end in ends.to_launcher)
+        wait_until(lambda: end in ends.to_launcher)
         supervisor.setblocking(False)  # what it has said before is there when its end is known
         assert b"".join(iter(lambda: supervisor.recv(1 << 16), b"")) == words
         supervisor.close()
@@ -383,7 +384,7 @@ class TestPump:
         end = NodeEnded("eye", "exit code 0")
         ends.agent._listener = ends.listener
         ends.agent.send_last(end)
-        wait_for(lambda: end in ends.to_launcher)
+        wait_until(lambda: end in ends.to_launcher)
         supervisor = ends.supervisor.accept()
         assert supervisor is not None
         supervisor.setblocking(False)
@@ -394,7 +395,7 @@ class TestPump:
 
     def test_who_hangs_up_is_missed_at_once(self, ends: Ends) -> None:
         ends.agent.end()
-        wait_for(lambda: ends.lost)
+        wait_until(lambda: ends.lost)
         assert ends.lost == ["the connection was closed"]
 
     def test_all_that_was_said_is_heard_though_its_end_is_noticed_by_writing(self) -> None:
@@ -450,7 +451,7 @@ class Ends:
     def accepted(self) -> ControlStream:
         """The control connection that has come through."""
         found: list[ControlStream] = []
-        wait_for(lambda: found.extend(filter(None, [self.supervisor.accept()])) or found)
+        wait_until(lambda: found.extend(filter(None, [self.supervisor.accept()])) or found)
         found[0].setblocking(True)
         return found[0]
 
@@ -460,13 +461,6 @@ class Ends:
             pump.join(_SOON_S)
         self.supervisor.close()
         self.listener.close()
-
-
-def wait_for(condition: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + _SOON_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
 
 
 class TestCommand:

@@ -7,8 +7,6 @@ import contextlib
 import json
 import re
 import socket
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from deadlines import wait_until
 from foxglove_app import DEADLINE_S, App, app
 from launching import Running, start
 from neuros_dashboard import web
@@ -49,12 +48,6 @@ def sent(connected: App) -> int:
     return int(figures.get("sent", 0))
 
 
-def wait_until(condition: Callable[[], Any]) -> None:
-    give_up_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < give_up_s, "deadline passed"
-
-
 def test_an_app_sees_a_run_and_pauses_and_steps_it_beside_a_dashboard(tmp_path: Path) -> None:
     with contextlib.ExitStack() as stack:
         taken = stack.enter_context(socket.socket())
@@ -80,20 +73,20 @@ def test_an_app_sees_a_run_and_pauses_and_steps_it_beside_a_dashboard(tmp_path: 
         assert message_codec(Imu).decode(connected.next("/world/imu")).header.frame_id == "head"
         image = message_codec(Image).decode(connected.next("/world/image"))
         assert (image.width, image.height) == (640, 480)
-        wait_until(lambda: b"run folder" in connected.next("/neuros/log"))
+        wait_until(lambda: b"run folder" in connected.next("/neuros/log"), DEADLINE_S)
 
         # A paused run makes steps: each sends a packet.
         assert connected.call("/neuros/pause", {}) == {}
-        wait_until(lambda: json.loads(connected.next("/neuros/run"))["is_paused"])
+        wait_until(lambda: json.loads(connected.next("/neuros/run"))["is_paused"], DEADLINE_S)
         before = sent(connected)
         assert connected.call("/neuros/step", {"count": 3}) == {}
-        wait_until(lambda: sent(connected) >= before + 3)
+        wait_until(lambda: sent(connected) >= before + 3, DEADLINE_S)
         for wrong in ({"count": 0}, {"count": "three"}, ["count"]):
             assert 'give {"count": N} with N from 1 to 1000000' in connected.call(
                 "/neuros/step", wrong
             )
         assert connected.call("/neuros/resume", {}) == {}
-        wait_until(lambda: sent(connected) > before + 10)
+        wait_until(lambda: sent(connected) > before + 10, DEADLINE_S)
 
         # Other machines have no way in; the end of the run ends the connection.
         with pytest.raises(ConnectionRefusedError):
@@ -115,7 +108,7 @@ def test_a_robot_in_mujoco_is_a_scene_whose_frames_move(tmp_path: Path) -> None:
         assert b"robot/arm" in connected.next("/neuros/world")
         still = connected.next("/tf")
         assert b"robot/arm" in still
-        wait_until(lambda: connected.next("/tf")[-40:] != still[-40:])
+        wait_until(lambda: connected.next("/tf")[-40:] != still[-40:], DEADLINE_S)
         # Who comes later gets the scene, too.
         with app(url_of(running)) as second:
             second.subscribe("/neuros/world")
@@ -144,22 +137,22 @@ def test_nothing_is_asked_of_nodes_while_nobody_looks(feed: Any) -> None:
         assert not feed.wants_log
         connected.subscribe("/a/x")
         asked: list[Any] = []
-        wait_until(lambda: asked.extend(feed.ask()) or asked)
+        wait_until(lambda: asked.extend(feed.ask()) or asked, DEADLINE_S)
         assert asked[0] == GetStatus({"a": {"x": {"packets": True}}})
         connected.unsubscribe()
-        wait_until(lambda: [*feed.ask()] == [])
+        wait_until(lambda: [*feed.ask()] == [], DEADLINE_S)
         connected.subscribe("/tf")
         asked.clear()
-        wait_until(lambda: asked.extend(feed.ask()) or asked)
+        wait_until(lambda: asked.extend(feed.ask()) or asked, DEADLINE_S)
         assert asked[0] == GetStatus({"a": {"#world": {"frames": True, "geometry": True}}})
-    wait_until(lambda: [*feed.ask()] == [])
+    wait_until(lambda: [*feed.ask()] == [], DEADLINE_S)
 
 
 def test_a_message_type_that_is_not_installed_is_said_and_left_out(feed: Any) -> None:
     with app(feed.url) as connected:
         assert "/a/y" not in connected.channels
         connected.subscribe("/a/x")
-        wait_until(lambda: feed._newcomers)
+        wait_until(lambda: feed._newcomers, DEADLINE_S)
         assert [*feed.ask()]
         connected.receive()
         assert (
@@ -171,7 +164,7 @@ def test_a_message_type_that_is_not_installed_is_said_and_left_out(feed: Any) ->
 def test_packets_are_as_far_apart_as_they_were(feed: Any) -> None:
     with app(feed.url) as connected:
         connected.subscribe("/a/x")
-        wait_until(lambda: [*feed.ask()])
+        wait_until(lambda: [*feed.ask()], DEADLINE_S)
         rows = [(7.0, b"first"), (7.5, b"second")]
         feed.handle(NodeStatus("a", 1, samples={"x": {"packets": rows}}))
         assert [connected.next("/a/x"), connected.next("/a/x")] == [b"first", b"second"]

@@ -9,13 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from deadlines import wait_until
 from docker import DockerClient
 from endings import GONE_WITHIN_S
 from launching import start
 from neuros_dashboard.windows import TOOL_IMAGE
 from visitor import WATCHED, Visitor, address, is_full
 
-from containers import connected, require_containers, wait_until
+from containers import connected, require_containers
 from neuros.backends.domain import choose_domain
 
 # A stand-in for the tools of a ROS distribution, which no test machine has the gigabytes for.

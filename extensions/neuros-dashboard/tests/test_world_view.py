@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import time
-from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import browser_page
+from deadlines import wait_until
 from launching import start
 from PIL import Image
 from visitor import Visitor, address
@@ -40,12 +39,6 @@ def where(pixels: Any, colour: int) -> Any:
     return np.argwhere(pixels[:, :, colour] > others + 60)
 
 
-def wait_until(condition: Callable[[], Any]) -> None:
-    give_up_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < give_up_s, "deadline passed"
-
-
 with_reports = pytest.mark.skipif(
     find_spec("neuros_analysis") is None, reason="the report of the run is neuros-analysis's"
 )
@@ -67,7 +60,7 @@ def test_a_robot_is_seen_turning_in_a_browser(tmp_path: Path) -> None:
 
         # The model's own camera looks down on a red arm, which turns about a green ball.
         page.select_option("#world-camera", "camera above")
-        wait_until(lambda: len(where(picture(page), 1)) > 50)
+        wait_until(lambda: len(where(picture(page), 1)) > 50, DEADLINE_S)
         ball = where(picture(page), 1).mean(axis=0)
         middle = np.array(picture(page).shape[:2]) / 2
         assert ball == pytest.approx(middle, abs=15)  # the arm covers a part
@@ -79,24 +72,24 @@ def test_a_robot_is_seen_turning_in_a_browser(tmp_path: Path) -> None:
                 sides.add(bool(arm[:, 1].mean() > ball[1]))
             return len(sides) == 2
 
-        wait_until(has_been_left_and_right)
+        wait_until(has_been_left_and_right, DEADLINE_S)
 
         # It stands still with the run.
         page.click("#pause")
         page.wait_for_selector("#phase.paused")
-        wait_until(lambda: np.array_equal(picture(page), picture(page)))
+        wait_until(lambda: np.array_equal(picture(page), picture(page)), DEADLINE_S)
         still = picture(page)
 
         # The user turns the free camera with the mouse, also then.
         page.select_option("#world-camera", "follow arm")
-        wait_until(lambda: not np.array_equal(picture(page), still))
+        wait_until(lambda: not np.array_equal(picture(page), still), DEADLINE_S)
         before = picture(page)
         page.locator("#world canvas").drag_to(
             page.locator("#world canvas"),
             source_position={"x": 150, "y": 200},
             target_position={"x": 350, "y": 250},
         )
-        wait_until(lambda: not np.array_equal(picture(page), before))
+        wait_until(lambda: not np.array_equal(picture(page), before), DEADLINE_S)
         assert len(where(picture(page), 0)) > 50
 
         assert visitor.post("/do/stop") == 204
@@ -109,14 +102,14 @@ def test_a_robot_is_seen_turning_in_a_browser(tmp_path: Path) -> None:
         page.goto(f"file://{finished.run_folder}/report/world_robot.html")
         page.wait_for_function(IS_DRAWN.replace("> 2", "> 0"))
         page.select_option("#camera", "camera above")
-        wait_until(lambda: len(where(picture(page), 0)) > 50)
+        wait_until(lambda: len(where(picture(page), 0)) > 50, DEADLINE_S)
         begin = picture(page)
 
         def is_elsewhere_after_a_slide() -> bool:
             page.locator("#time").evaluate(SLIDE)
             return bool(np.abs(picture(page) - begin).max() > 60)
 
-        wait_until(is_elsewhere_after_a_slide)
+        wait_until(is_elsewhere_after_a_slide, DEADLINE_S)
         time_s = page.input_value("#time")
         page.click("#play")
         page.wait_for_function("(t) => document.querySelector('#time').value !== t", arg=time_s)

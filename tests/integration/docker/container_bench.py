@@ -10,11 +10,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from deadlines import wait_until
 from docker import DockerClient
 from endings import GONE_WITHIN_S, KEEP_THE_GIL, dead_shared_memory
 from launching import Finished, Running, start
 
-from containers import nothing_left, wait_until
+from containers import nothing_left
 from neuros.backends.docker.settings import shared_memory
 from neuros.backends.run_processes import RUN_ID, RunProcesses
 from neuros.backends.sessions import RunOnThisMachine, sessions

@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import wait_until
 from docker.context import ContextAPI
 from docker.errors import APIError
 from needs import cannot_run
 
-from containers import connected, require_containers, wait_until
+from containers import connected, require_containers
 from neuros.backends.docker.building import context_of, pulled
 from neuros.backends.docker.images import image_for
 from neuros.cli.main import main

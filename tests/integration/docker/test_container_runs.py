@@ -15,11 +15,12 @@ from pathlib import Path
 import psutil
 import pytest
 from container_bench import HOLDS_THE_GIL, ContainerBench, container_bench
+from deadlines import wait_until
 from endings import GONE_WITHIN_S, RUNS
 from launching import EXAMPLES, Finished, Running, launch, start
 from virtual_display import virtual_display
 
-from containers import require_containers, wait_until
+from containers import require_containers
 from neuros.backends.control_sockets import SOCKET_NAME
 from neuros.backends.docker.engine import engine_socket
 from neuros.backends.docker.launcher import Containers, DockerLauncher

@@ -15,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from deadlines import wait_until
 from docker import DockerClient
 from launching import Running, start
 from outside_asker import PROGRAM
 
-from containers import nothing_left, require_containers, wait_until
+from containers import nothing_left, require_containers
 from neuros.backends.docker.images import image_for
 from neuros.backends.domain import choose_domain
 from neuros.doctor.checks import PROJECT as IMAGES

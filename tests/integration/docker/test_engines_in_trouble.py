@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 from container_bench import ContainerBench, container_bench
+from deadlines import wait_until
 from endings import RUNS
 from engines import OwnEngine, own_engine, require_engines
 from machines import Machine
 
-from containers import wait_until
 from neuros.backends.run_processes import RunProcesses
 from neuros.cli.main import main
 

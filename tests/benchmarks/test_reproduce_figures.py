@@ -1,4 +1,4 @@
-"""The tables of reproduced experiments, from files that a run leaves."""
+"""The figures of reproduced experiments, from files that a run leaves."""
 
 from __future__ import annotations
 
@@ -10,53 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.reproduce import tick, whiskeye, whiskeye_runs
+from benchmarks.reproduce import whiskeye_runs
 from benchmarks.reproduce.experiment import Entry
 from benchmarks.reproduce.intervals import histogram, interval_figures, intervals_of
 from benchmarks.reproduce.kinds import Reading
 from benchmarks.reproduce.load import load_between
-from benchmarks.reproduce.tables import Layout, Ours, Published, Remark, spread_text
-from benchmarks.reproduce.whiskeye_curves import head_direction
 from neuros.api.run_record import FORMAT
 
 MS = 1_000_000
-
-
-def reading(name: str, number: int, **figures: float | None) -> Reading:
-    return Reading(f"{name}-{number}", name, figures, {"backend": "process"}, None)
-
-
-# ------------------------------------------------------------------ tables
-
-
-def test_a_table_has_medians_ranges_and_what_was_published() -> None:
-    layout = Layout(
-        "speed",
-        [
-            Remark("back end", "backend"),
-            Ours("speed", "speed"),
-            Published("published", {"strict": 0.18, "other": 14}),
-        ],
-        others=["other"],
-    )
-    readings = {
-        "strict": [reading("strict", n, speed=speed) for n, speed in enumerate((3.0, 1.0, 2.5))],
-        "hybrid": [reading("hybrid", 1, speed=None)],
-    }
-
-    table = layout.fill({"hybrid": "Hybrid", "strict": "Strict", "not run": "Not run"}, readings)
-
-    assert table.headers == ["", "back end", "speed", "published"]
-    assert table.rows == [
-        ["other", "–", "–", "14"],
-        ["Hybrid", "process", "–", "–"],
-        ["Strict", "process", "2.5 (1.0 to 3.0)", "0.18"],
-    ]
-
-
-def test_a_range_that_cannot_be_seen_is_not_shown() -> None:
-    assert spread_text([1.01, 1.02], "{:.1f}") == "1.0"
-    assert spread_text([], "{:.1f}") == "–"
 
 
 # ------------------------------------------------------------------ intervals
@@ -78,34 +39,6 @@ def test_intervals_are_counted_as_those_of_hooks_are() -> None:
 def test_one_moment_has_no_interval() -> None:
     assert intervals_of([0], 0.02) is None
     assert interval_figures(None) == {}
-
-
-def test_the_tick_table_has_published_shares_below_ours(tmp_path: Path) -> None:
-    moments = [0, 1000 * MS, 2001 * MS]
-    for name, file in (("neuros", "ticker/result.json"), ("rclpy", "result.json")):
-        target = tmp_path / name / file
-        target.parent.mkdir(parents=True)
-        target.write_text(json.dumps(moments))
-    record = {"format": FORMAT, "backend": "docker", "connections": []}
-    (tmp_path / "neuros/run.json").write_text(json.dumps(record))
-    readings = {
-        name: [tick.read(tmp_path / name, Entry(name, 1, 0.0, 0.0))] for name in ("neuros", "rclpy")
-    }
-
-    (section,) = tick.show(readings, tmp_path)
-
-    assert section.table is not None
-    shown = [
-        (row[0], row[1], row[section.table.headers.index("within 1 ms, %")])
-        for row in section.table.rows
-    ]
-    assert shown == [
-        ("NeuROS, here", "docker", "100.0"),
-        ("NeuROS, published", "–", "61.1"),
-        ("bare rclpy timer, here", "–", "100.0"),
-        ("bare rclpy timer, published", "–", "73.6"),
-    ]
-    assert [picture.read_bytes()[:4] for picture in section.figures] == [b"\x89PNG"]
 
 
 # ------------------------------------------------------------------ system load
@@ -231,36 +164,3 @@ def test_packets_and_errors_are_read(read: Reading) -> None:
     }
     assert {key: read.figures[key] for key in expected} == pytest.approx(expected)
     assert read.remarks == {"backend": "process", "estimates_digest": "01234567"}
-
-
-def test_all_sections_have_tables_and_pictures(read: Reading, tmp_path: Path) -> None:
-    free = Reading("strict-1", "strict", read.figures, read.remarks, read.series)
-    sections = whiskeye.show({"strict": [free], "tick_20ms": [read]}, tmp_path)
-    tables = {section.table.name: section.table for section in sections if section.table}
-    assert [*tables] == ["heading", "speed", "delivery", "packets", "load", "tick_intervals"]
-    assert tables["heading"].rows[-1][2:6] == ["5.40", "-3.50", "13.10", "1.0034"]
-    assert [row[0] for row in tables["speed"].rows] == [
-        "Neurorobotics Platform",
-        "tick 20 ms",
-        "strict",
-    ]
-    assert [row[-1] for row in tables["speed"].rows] == ["14", "–", "0.18"]
-    assert [row[0] for row in tables["tick_intervals"].rows] == ["tick 20 ms"]
-    pictures = [picture for section in sections for picture in section.figures]
-    assert {picture.name for picture in pictures} == {
-        "head_direction.png",
-        "heading_error.png",
-        "speed.png",
-        "delivery.png",
-        "packets.png",
-        "load.png",
-        "tick_intervals.png",
-    }
-    assert all(picture.read_bytes()[:4] == b"\x89PNG" for picture in pictures)
-
-
-def test_the_same_runs_give_the_same_picture(read: Reading, tmp_path: Path) -> None:
-    files = [tmp_path / "a.png", tmp_path / "b.png"]
-    for file in files:
-        head_direction({"tick_20ms": "tick"}, {"tick_20ms": [read]}, file)
-    assert files[0].read_bytes() == files[1].read_bytes()
