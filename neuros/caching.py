@@ -29,7 +29,6 @@ class Kept:
 
     @property
     def log(self) -> Path:
-        """The log of its build."""
         return self.beside(".log")
 
     @property

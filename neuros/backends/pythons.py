@@ -186,12 +186,10 @@ class Pythons:
 
     @property
     def notices(self) -> list[str]:
-        """Notices for the user."""
         return [choice.notice for choice in self._each() if choice.notice]
 
     @property
     def is_made(self) -> bool:
-        """Whether all environments exist."""
         return not any(choice.base for choice in self._each())
 
     def record_use(self) -> None:

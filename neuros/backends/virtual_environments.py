@@ -55,7 +55,6 @@ _PLANNED = re.compile(r"^ \+ (.+)$", re.MULTILINE)
 
 
 def cache_folder(environ: Mapping[str, str]) -> Path:
-    """The folder of all environments."""
     return cache_root(environ) / "environments"
 
 

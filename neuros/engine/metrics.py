@@ -186,7 +186,6 @@ class TimeBudget:
 
     @property
     def total_s(self) -> float:
-        """The sum."""
         rest = sum(self.waiting.values()) + sum(self.blocked.values()) + self.idle_s
         return self.own_s + rest
 

@@ -54,7 +54,6 @@ class StallDetector:
         self._named_as_starving: set[tuple[str, str]] = set()
 
     def report(self, report: Report, now_s: float) -> None:
-        """Add a report."""
         name = report.node
         node = self._nodes[name]
         before = _movement(node.report)
@@ -76,7 +75,6 @@ class StallDetector:
 
     @property
     def is_complete(self) -> bool:
-        """Whether all nodes have begun."""
         return all(node.is_there and node.has_begun for node in self._nodes.values())
 
     @property
@@ -339,7 +337,6 @@ class Backlog:
         self._named: set[str] = set()
 
     def report(self, report: Report, now_s: float) -> None:
-        """Add a report of a node."""
         metrics = report.metrics
         if metrics is None:
             return

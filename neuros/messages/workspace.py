@@ -87,7 +87,6 @@ class Workspaces:
 
     @cached_property
     def packages(self) -> dict[str, Package]:
-        """All packages, by name."""
         return {**self._shared.packages, **self._own.packages}
 
     @property
@@ -227,7 +226,6 @@ class Built(Kept):
 
     @property
     def package(self) -> str:
-        """The name of the package."""
         return self.folder.name[: -KEY_LENGTH - 1]
 
     @property

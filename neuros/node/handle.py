@@ -487,7 +487,6 @@ class Results:
         self._values: dict[str, Any] = {}
 
     def clear(self) -> None:
-        """Forget all."""
         self._values = {}
         self._file.unlink(missing_ok=True)
 

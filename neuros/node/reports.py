@@ -71,7 +71,6 @@ class NodeReports:
         self._has_begun = True
 
     def begin_anew(self, engine: Engine) -> None:
-        """The node was reset, and has this engine now."""
         self._engine = engine
         if self._packet_log is not None:
             self._packet_log.begin_anew(engine)

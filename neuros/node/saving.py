@@ -30,7 +30,6 @@ class Saving:
         return any(each not in self._before for each in self._open_files())
 
     def _open_files(self) -> Iterator[Path]:
-        """What is open for writing."""
         for number in os.listdir("/proc/self/fd"):
             try:
                 path = Path(os.readlink(f"/proc/self/fd/{number}"))

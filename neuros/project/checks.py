@@ -65,7 +65,6 @@ def mistakes(parsed: ParsedProject) -> list[Problem]:
 
 
 def _ports_of(node: Element) -> Iterator[tuple[Element, Side]]:
-    """Every port of a node, with its side."""
     for side in _SIDES:
         for port in node.items(side):
             yield port, side

@@ -75,7 +75,6 @@ class Remark:
     hint: str = ""
 
     def in_file(self, path: Path) -> Problem:
-        """The problem that messages show."""
         return Problem(display_name(path), self.line, self.column, "", self.text, self.hint)
 
 

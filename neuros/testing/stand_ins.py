@@ -96,12 +96,10 @@ class Topics:
         self.inbox = inbox
 
     def deliver(self, port: Port, packet: Any) -> None:
-        """Deliver a packet to the input of an external topic."""
         if self.inbox is not None:
             self.inbox.on_external_packet(port, packet)
 
     def send_external(self, port: Port, packet: Any) -> None:
-        """Keep a packet."""
         self.published.setdefault(port.name, []).append(copy_packet(packet))
 
     def show(self, connections: Sequence[Connection], packet: Any) -> None:

@@ -104,7 +104,6 @@ class LargeOutput:
         return _parcel(self._buffers.encode_rest(packet), place)
 
     def close(self) -> None:
-        """Remove the shared memory."""
         self._writer.close()
 
 
@@ -154,7 +153,6 @@ class LargeInput:
         return self._buffers.decode_with(message, buffers)
 
     def close(self) -> None:
-        """Give up the shared memory."""
         self._reader.close()
 
 
@@ -177,7 +175,6 @@ class LargeCodecs:
         self.inputs: dict[Connection, LargeInput] = {}
 
     def decoder(self, connection: Connection) -> Decoder:
-        """The decoder of a connection to this node."""
         kind = packet_kind(self._node.input(connection.destination_input).type)
         buffers = message_buffers(kind)
         if buffers is None:
@@ -356,7 +353,6 @@ class MessageBuffers:
         return packet
 
     def put_back(self, packet: Any, buffers: Sequence[array[Any]]) -> None:
-        """Give a message these buffers."""
         for (*path, slot), buffer in zip(self._paths, buffers, strict=True):
             holder = packet
             for each in path:
@@ -380,7 +376,6 @@ class ArrayBuffers:
         return [packet.reshape(-1)]
 
     def views(self, packet: Any) -> Sequence[memoryview]:
-        """The bytes of the numbers."""
         return [memoryview(packet.reshape(-1)).cast("B")]
 
     def encode_rest(self, packet: Any) -> bytes:
@@ -476,7 +471,6 @@ class SegmentWriter:
         return BufferPlace(mapping.name, mapping.slot_bytes, slot, self._generation, lengths)
 
     def close(self) -> None:
-        """Remove all segments; who has mapped one keeps what it has."""
         mappings = [mapping for _, mapping in self._former]
         if self._current is not None:
             mappings.append(self._current)
@@ -540,7 +534,6 @@ class SegmentReader:
         return found
 
     def close(self) -> None:
-        """Give up the mapping."""
         self._mapping = None
 
 
@@ -555,7 +548,6 @@ class _Mapping:
         self._memory = memory
 
     def release(self) -> None:
-        """Unmap it."""
         self.generations.release()
         self.bytes.release()
         self._memory.close()

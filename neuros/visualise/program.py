@@ -87,7 +87,6 @@ class Panel:
 
     @property
     def end_s(self) -> float:
-        """The latest time."""
         ends = [max(series.times) for series in self.series.values() if series.times]
         return max(ends, default=0.0)
 
@@ -448,7 +447,6 @@ class Drawing:
         return _EVENTS_S if self._canvas.is_window else self._save_every_s
 
     def draw_and_save(self) -> None:
-        """Draw and save the final state."""
         self._draw()
         self._save()
 

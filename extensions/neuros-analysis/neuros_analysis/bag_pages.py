@@ -72,7 +72,6 @@ def times_of(bag: Bag) -> list[TopicTimes]:
 
 
 def bag_page(bag: Bag, topics: list[TopicTimes]) -> str:
-    """The page of a bag."""
     told = [f"{bag.duration_s:.2f} s", f"{sum(len(t.times_s) for t in topics)} packets"]
     told += [f"ROS {bag.distribution.capitalize()}"] if bag.distribution else []
     parts = [f"<p>{escape('; '.join(told))}.</p>"]

@@ -236,7 +236,6 @@ class Findings:
 
 
 def findings_of(run: ReviewedRun) -> Findings:
-    """The findings on a run, in sentences."""
     budgets = run.time_budgets
     if not budgets or not run.running_s:
         return Findings("The bottleneck is not known: no node has reported how it spent its time.")

@@ -347,7 +347,6 @@ def _main() -> None:
 
 
 def add_pack(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     parser.description = (
         "Write a run with its project, its packages and NeuROS into one file, an RO-Crate."
         " `neuros verify FILE` unpacks it, runs the project again and compares all packets."

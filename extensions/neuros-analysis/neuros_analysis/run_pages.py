@@ -299,7 +299,6 @@ def _in_script(content: Any) -> str:
 
 
 def _panels(name: str, topic: RecordedTopic, start_ns: int) -> Iterator[dict[str, Any]]:
-    """The panels of an output."""
     if not topic.count:
         return
     if topic.type == SPIKES:

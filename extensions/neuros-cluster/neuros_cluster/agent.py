@@ -75,7 +75,6 @@ _KEPT_S = 7 * 24 * 3600.0
 
 
 def add_agent(agent: argparse.ArgumentParser) -> None:
-    """Add the options of the program, which ``launch`` starts on another machine."""
     agent.add_argument("--in-image", action="store_true")
     agent.set_defaults(command=lambda options: Agent(is_in_image=options.in_image).run())
 

@@ -47,7 +47,6 @@ _EXECUTABLE = "+x"
 
 
 def tree_cache(environ: Mapping[str, str]) -> Path:
-    """The folder of all trees."""
     return cache_root(environ) / "machines"
 
 

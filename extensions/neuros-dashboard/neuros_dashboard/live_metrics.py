@@ -205,7 +205,6 @@ class LiveMetrics:
         return None if speed is None else speed.per_s
 
     def update(self, status: NodeStatus) -> None:
-        """Update the metrics from the status of a node."""
         counters = status.counters
         if counters is None:
             self.nodes[status.node] = {"state": "loading", "cause": ""}

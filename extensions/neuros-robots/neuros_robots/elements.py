@@ -122,7 +122,6 @@ class Difference:
 
     @property
     def path(self) -> str:
-        """The path of the first one."""
         return self.paths[0]
 
     @property
@@ -225,7 +224,6 @@ class Element:
 
     @property
     def path(self) -> str:
-        """Its path in the document, as ``model[arm]/link[base]/inertial``."""
         if self.source is not None:
             return self.source.path
         steps = [e.tag + (f"[{e.name}]" if e.name else "") for e in self.and_ancestors()][::-1]
@@ -280,7 +278,6 @@ class Element:
         return element
 
     def each(self, tag: str) -> list[Element]:
-        """All children with that tag."""
         found = [child for child in self.children if child.tag == tag]
         for child in found:
             child.is_read = True
@@ -354,7 +351,6 @@ class Element:
         return word in ("true", "1")
 
     def has(self, attribute: str) -> bool:
-        """Whether an attribute is true."""
         return self.attributes.get(attribute) in ("true", "1")
 
     def text_of(self, tag: str) -> str:
@@ -403,7 +399,6 @@ class _Builder:
 
     @property
     def line(self) -> int:
-        """The present line of the file."""
         return self.parser.CurrentLineNumber + self.skipped_lines
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
