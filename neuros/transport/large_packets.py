@@ -101,7 +101,20 @@ class LargeOutput:
             self._has_room = False
             self._warn(f"large packets of {self._owner} go through DDS, which is slower: {error}")
             return self._plain.encode(packet)
-        return _parcel(self._buffers.encode_rest(packet), place)
+        message = self._buffers.encode_rest(packet)
+        name = place.segment.encode()
+        # RTPS pads to four bytes by itself, and the note must be found from the end.
+        padding = bytes(-(len(message) + len(name)) % 4)
+        lengths = struct.pack(f"<{len(place.lengths)}Q", *place.lengths)
+        note = _NOTE.pack(
+            place.generation,
+            place.slot_bytes,
+            place.slot,
+            len(message),
+            len(place.lengths),
+            len(name),
+        )
+        return b"".join((message[:2], PARCEL_MARK, message[4:], padding, lengths, name, note))
 
     def close(self) -> None:
         self._writer.close()
@@ -259,22 +272,6 @@ def _is_large(buffers: Sequence[array[Any]]) -> bool:
     for buffer in buffers:
         size += len(buffer) * buffer.itemsize
     return size >= LARGE_BYTES
-
-
-def _parcel(message: bytes, place: BufferPlace) -> bytes:
-    name = place.segment.encode()
-    # RTPS pads to four bytes by itself, and the note must be found from the end.
-    padding = bytes(-(len(message) + len(name)) % 4)
-    lengths = struct.pack(f"<{len(place.lengths)}Q", *place.lengths)
-    note = _NOTE.pack(
-        place.generation,
-        place.slot_bytes,
-        place.slot,
-        len(message),
-        len(place.lengths),
-        len(name),
-    )
-    return b"".join((message[:2], PARCEL_MARK, message[4:], padding, lengths, name, note))
 
 
 def _contents(data: bytes) -> tuple[bytes, BufferPlace]:
