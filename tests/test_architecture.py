@@ -108,7 +108,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "snn.nest": {"numpy", "nest"},
     "backends.docker": {"docker", "requests"},
     "backends.console": {"tqdm"},
-    "backends.virtual_environments": {"packaging"},
+    "backends.pythons": {"packaging"},
     "pytest_plugin": {"pytest"},
     "ros_launch": {"launch"},
     "api.packets": {"numpy", "xxhash"},

@@ -36,8 +36,7 @@ from neuros.launcher.outcome import (
 )
 from neuros.launcher.peers import EndElsewhere, Peers, Stage
 from neuros.launcher.quiescence import Declarations, Probing, Verdict, connections_among
-from neuros.launcher.stall_detector import SILENT_S, Backlog, StallDetector
-from neuros.launcher.thread_reader import ThreadReader
+from neuros.launcher.stall_detector import SILENT_S, Backlog, StallDetector, ThreadReader
 from neuros.ports import ControlListener, Launcher, RunningNode
 from neuros.project.model import NodeFile
 

@@ -115,7 +115,7 @@ def _locked(record: Mapping[str, Any], project: Project) -> list[tuple[str, str]
     from packaging.requirements import InvalidRequirement, Requirement
 
     from neuros.backends.containers import find_container
-    from neuros.backends.virtual_environments import read_requirements
+    from neuros.backends.pythons import read_requirements
 
     versions = record["versions"]
     had = {_plain(name): version for name, version in versions["packages"].items()}
