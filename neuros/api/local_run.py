@@ -722,7 +722,6 @@ class _Watchdog:
         self.hang = ""
 
     def begin(self) -> None:
-        """Watch from now on."""
         self._thread.start()
 
     def end(self) -> None:

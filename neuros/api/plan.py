@@ -151,7 +151,6 @@ class Plan:
 
     @property
     def nodes(self) -> list[Node]:
-        """The nodes to start."""
         return [self.project.node(name) for name in self.names]
 
     @property
@@ -176,12 +175,10 @@ class Plan:
 
     @property
     def nodes_here(self) -> list[Node]:
-        """The nodes to start on this machine."""
         return [node for node in self.nodes if node.name not in self.places]
 
     @property
     def is_partial(self) -> bool:
-        """Whether some nodes are not started."""
         return bool(self.elsewhere)
 
     @property
@@ -459,5 +456,4 @@ def make_environments(pythons: Pythons, messages: Messages | None, output: Strea
 
 
 def are_made(pythons: Pythons, messages: Messages | None) -> bool:
-    """Whether nothing is missing."""
     return pythons.is_made and (messages is None or messages.is_made)

@@ -143,7 +143,6 @@ class NodeView:
 
 
 def finalising(nodes: Sequence[NodeView]) -> NodeView | None:
-    """The node of a process that finalises now."""
     return next((node for node in nodes if node.hook is not None), None)
 
 

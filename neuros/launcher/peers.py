@@ -234,7 +234,6 @@ class Peers:
             self._others[state.run] = state
 
     def end(self, now_s: float) -> EndElsewhere | None:
-        """The end of the project elsewhere, if there is one."""
         for node, gone_s in self._gone_s.items():
             state = self._others[self._run_of[node]]
             if not state.is_ending and now_s - gone_s >= _GRACE_S:

@@ -229,7 +229,6 @@ class Supervisor:
         self._handle(RunEvent.FAILURE)
 
     def _log(self, severity: str, text: str) -> None:
-        """Log for the user and the observers."""
         self._output.log(severity, text)
         self.observers.tell(control.LogRecord(severity, text))
 

@@ -51,7 +51,6 @@ class Package:
 
     @property
     def messages(self) -> set[str]:
-        """The names of its messages."""
         return {file.stem for file in self.files if file.suffix == ".msg"}
 
     @property

@@ -208,7 +208,6 @@ def _find(folder: Path | None) -> _Found:
 
 
 def cycle_problem(workspaces: Workspaces, error: CycleError) -> Problem:
-    """The problem of packages that need each other."""
     names: list[str] = error.args[1]
     package = workspaces.packages[names[0]]
     text = f"found packages that need each other: {' -> '.join(names)}"
@@ -230,7 +229,6 @@ class Built(Kept):
 
     @property
     def python(self) -> Path:
-        """The folder for Python's path."""
         return self.folder / "python"
 
     @property

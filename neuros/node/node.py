@@ -478,7 +478,6 @@ class NodeRuntime:
         self.specs = self._plugin = with_clocks(node, specs)
 
     def _make(self) -> Engine:
-        """The engine for the hooks of now."""
         node = self.file.node
         packets = self._middleware.packets
         jpegs = {

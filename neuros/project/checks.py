@@ -221,7 +221,6 @@ def _compression(connection: Element, types: list[str]) -> Iterator[Problem]:
 
 
 def unconnected_ports(parsed: ParsedProject) -> Iterator[Problem]:
-    """Ports that nothing is connected to."""
     used = {
         (side, connection.string(node), connection.string(port))
         for connection in parsed.connections

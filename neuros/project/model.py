@@ -313,7 +313,6 @@ class Connection:
 
     @property
     def keys(self) -> dict[str, Any]:
-        """The keys in a project file."""
         values = {f.name: (getattr(self, f.name), f.default) for f in fields(self)}
         del values["index"], values["namespace"]
         keys = {key: value for key, (value, default) in values.items() if value != default}
@@ -416,7 +415,6 @@ class Project:
 
     @property
     def folder(self) -> Path:
-        """The folder of the project file."""
         return self.file.parent
 
     def node(self, name: str) -> Node:

@@ -87,7 +87,6 @@ class Element:
 
     @property
     def text(self) -> str:
-        """The JSON text of the value."""
         return self.source.text[self.start : self.end]
 
     @property

@@ -53,7 +53,6 @@ def split(project: Project, folders_for: Callable[[Node], Folders]) -> tuple[Nod
 
 
 def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
-    """The content of ``node.json``."""
     node = node_file.node
     return {
         "node": {**_node_keys(node), "environment": dict(node.environment)},

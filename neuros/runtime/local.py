@@ -468,7 +468,6 @@ class LocalMiddleware:
         """Nothing: real time goes on, and is drawn from no seed."""
 
     def local_ros_node(self, file: NodeFile, logger: Logger) -> LocalRosNode:
-        """What a plugin gets as its ROS node."""
         node = file.node
         return LocalRosNode(node.name, logger, node.parameters, lambda _: self._ros_node(file))
 

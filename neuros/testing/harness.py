@@ -121,7 +121,6 @@ class Topics:
         self.published: dict[str, list[Any]] = {}
 
     def open(self, inbox: Inbox) -> None:
-        """Deliver to this inbox."""
         self.inbox = inbox
 
     def deliver(self, port: Port, packet: Any) -> None:
@@ -260,7 +259,6 @@ def with_observer(node: Node, connections: Sequence[Connection]) -> tuple[Connec
 
 
 def numbered(connections: Sequence[Connection]) -> tuple[Connection, ...]:
-    """The same connections with their places in this sequence."""
     return tuple(replace(each, index=index) for index, each in enumerate(connections))
 
 
@@ -312,7 +310,6 @@ class Neighbours:
     # ------------------------------------------------------------------ inbox
 
     def on_packet(self, connection: Connection, packet: Any) -> None:
-        """The node has sent a packet."""
         self.received[connection].append(packet)
         if connection not in self.busy:
             self.start_on(connection, None)

@@ -198,7 +198,6 @@ _OPEN: list[_Feed] = []
 
 
 def _close(feeds: Sequence[_Feed], patience_s: float) -> None:
-    """Close figures in parallel."""
     deadline_s = time.monotonic() + patience_s
     closing = [feed for feed in feeds if feed in _OPEN]
     for feed in closing:

@@ -88,7 +88,6 @@ def bag_page(bag: Bag, topics: list[TopicTimes]) -> str:
 
 
 def times_figure(topics: list[TopicTimes]) -> Any:
-    """A row of marks for each topic."""
     figure = new_figure(1.2 + _ROW_IN * len(topics))
     axes = plain(figure.add_subplot())
     marks = [t.times_s[:: -(-len(t.times_s) // _MOST_MARKS)] for t in topics]

@@ -125,7 +125,6 @@ class _Search:
         return self.budgets[node].own_s
 
     def _follow(self, node: str) -> tuple[list[Step], tuple[str, ...]]:
-        """The steps, and the loop in which they end."""
         steps: list[Step] = []
         seen: list[str] = []
         while True:

@@ -352,7 +352,6 @@ def _locked_folder(folder: Path) -> Iterator[None]:
 
 
 def _columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The columns of all rows; the folder is the last."""
     found = dict.fromkeys(name for row in rows for name in row)
     found.pop("folder", None)
     return [*found, "folder"]

@@ -416,7 +416,6 @@ class ClockOffset:
 
     @property
     def is_known(self) -> bool:
-        """Whether an answer has arrived."""
         return self.round_trip_s < float("inf")
 
     def data_here(self, data: bytes) -> bytes:

@@ -155,7 +155,6 @@ class Report:
             raise DescriptionError([Problem(display_name(file), 1, 1, "/", text)])
 
     def omit_unread(self, roots: Iterable[Element]) -> None:
-        """Note the topmost elements that were not read."""
         for root in roots:
             for child in root.children:
                 if not child.is_read:
@@ -284,7 +283,6 @@ class Element:
         return found
 
     def mark_all_read(self) -> None:
-        """Mark this element and all within as read."""
         for element in self.descendants():
             element.is_read = True
 

@@ -481,7 +481,6 @@ def _angles(settings: Element, way: str) -> tuple[int, list[float]]:
 
 
 def add_frames(building: Building, scope: Scope) -> None:
-    """Add a site for every ``<frame>``."""
     for inner, element in scope.each("frame"):
         if inner.is_world or element.name not in inner.frames or element.name[:1] == "_":
             continue
