@@ -28,11 +28,11 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 53_290)
+    hold("lines of neuros/", lines(NEUROS), 53_250)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 74_780)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 74_710)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
@@ -40,7 +40,7 @@ def test_lines_of_tests_and_benchmarks() -> None:
 
 
 def test_private_functions_that_are_used_once() -> None:
-    hold("percent of the functions of neuros/", used_once_percent(NEUROS), 6.68)
+    hold("percent of the functions of neuros/", used_once_percent(NEUROS), 6.1)
 
 
 def test_public_classes_of_one_name() -> None:

@@ -174,10 +174,6 @@ class Plan:
         return [*self.chosen.notices, *self.deployment.notices]
 
     @property
-    def nodes_here(self) -> list[Node]:
-        return [node for node in self.nodes if node.name not in self.places]
-
-    @property
     def is_partial(self) -> bool:
         return bool(self.elsewhere)
 
@@ -343,7 +339,8 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
     # A project may have been written for another machine: its cores are no mistake in it.
     problems = [
         f"{problem_in(node.file, f'{node.pointer}/affinity', text)}"
-        for node in plan.nodes_here
+        for node in plan.nodes
+        if node.name not in plan.places
         if plan.request.placement and (missing := set(node.affinity) - usable)
         for text in [f"node '{node.name}' asks for {_cores_in_words(missing)}"]
     ]

@@ -195,7 +195,7 @@ def _make(choice: Choice, progress: Progress, run_environment: Mapping[str, str]
     try:
         installer.make_environment(choice.base or Path(sys.executable))
         _add_links(choice)
-        if choice.requirements.has_hashes:
+        if any("--hash" in line.text for line in choice.requirements.lines):
             # uv refuses requirements without a hash, so those of NeuROS are installed first.
             if not choice.is_layered:
                 installer.install(needs)
@@ -303,11 +303,6 @@ class Requirements:
     file: Path
     lines: tuple[Line, ...]
     digest: str
-
-    @property
-    def has_hashes(self) -> bool:
-        """Whether uv refuses packages without a hash."""
-        return any("--hash" in line.text for line in self.lines)
 
     @property
     def editable(self) -> list[str]:
