@@ -124,7 +124,7 @@ THIRD_PARTY: dict[str, set[str]] = {
     "cli.template": {"std_msgs"},
     "cli.live": {"tabulate"},
     "cli.runs": {"tabulate"},
-    "node.copies": {"numpy"},
+    "node.handle": {"numpy"},
     "recording": {"mcap", "rosbags", "psutil", "tabulate", "numpy", "xxhash"},
     "recording.stored": {"mcap", "rosbags", "ruamel", "backports", "compression"},
     "visualise": {"numpy"},
