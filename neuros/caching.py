@@ -29,7 +29,6 @@ class Kept:
 
     @property
     def log(self) -> Path:
-        """The log of its build."""
         return self.beside(".log")
 
     @property
@@ -49,7 +48,6 @@ class Kept:
         shutil.rmtree(self.draft, ignore_errors=True)
 
     def beside(self, suffix: str) -> Path:
-        """The file or folder beside it with this suffix."""
         return self.folder.with_name(self.folder.name + suffix)
 
     def locked(self, *, wait: bool = True) -> contextlib.AbstractContextManager[bool]:

@@ -217,7 +217,6 @@ def add_options(
 
 
 def _completer(suggestions: Callable[[], Iterable[str]]) -> Callable[..., list[str]]:
-    """What argcomplete calls."""
     return lambda **_: [*suggestions()]
 
 
@@ -244,7 +243,6 @@ def values_of(options: Iterable[Option], parsed: argparse.Namespace) -> dict[str
 
 
 def parsed_as(declared_in: Callable[..., _Options], parsed: argparse.Namespace) -> _Options:
-    """A dataclass with the parsed values of its options."""
     return declared_in(**values_of(options_of(declared_in), parsed))
 
 

@@ -306,7 +306,6 @@ def choose(
 
 
 def option_values(back_end: BackEnd, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The value of each option of a back end, by name."""
     return {each.name: each.value(options.get(each.name)) for each in back_end.options}
 
 

@@ -142,7 +142,6 @@ class LocalRun:
         return self._is_behind
 
     def begin(self, known: Mapping[str, int]) -> AtRest | None:
-        """The initialise hooks have run."""
         return self._rest(known)
 
     def advance(
@@ -152,7 +151,6 @@ class LocalRun:
         end_s: float | None = None,
         end_sim_s: float | None = None,
     ) -> AtRest | None:
-        """Go on by rounds; see :meth:`HeldRun.advance`."""
         if self._run is not None:
             return None
         nodes = self._nodes.values()
@@ -179,7 +177,6 @@ class LocalRun:
         return self._rest(known)
 
     def run_for(self, duration_s: float, known: Mapping[str, int]) -> AtRest | None:
-        """Let the run go freely; see :meth:`HeldRun.run_for`."""
         if self._run is not None:
             return None
         began_s = time.monotonic()
@@ -202,19 +199,15 @@ class LocalRun:
         self._sent.append((self._nodes[node], port, copier_of(port.type)(packet)))
 
     def copy(self, type_name: str, content: Any) -> Any:
-        """A packet of its own for the program."""
         return copier_of(type_name)(content)
 
     def view(self, type_name: str, content: Any) -> Any:
-        """The packet that the run keeps itself."""
         return content
 
     def size_of(self, content: Any) -> int:
-        """The bytes of a packet when it is serialised."""
         return len(self._middleware.packets.encode(content))
 
     def change(self, changes: Changes, *, only_checks: bool = False) -> AtRest | None:
-        """Change environments and parameters; see :meth:`HeldRun.change`."""
         if self._run is not None:
             return None
         with self._thread:
@@ -223,7 +216,6 @@ class LocalRun:
         return self._rest({})
 
     def look(self) -> Sequence[NodeStatus] | None:
-        """State and counters of each node."""
         if self._run is not None or (not self._is_behind and self.advance(0, {}) is None):
             return None
         return [node.reports.status({}, 0) for node in self._nodes.values()]
@@ -231,7 +223,6 @@ class LocalRun:
     def reset(
         self, variables: Mapping[str, Mapping[str, str]], keep: Mapping[str, Sequence[str]]
     ) -> bool:
-        """Bring all nodes back to their start, if they can be; see :meth:`HeldRun.reset`."""
         nodes = self._nodes.values()
         is_fixed = self._thread.has_threads or any(node.why_not_reset for node in nodes)
         if self._run is not None or is_fixed:
@@ -257,13 +248,11 @@ class LocalRun:
     # ------------------------------------------------------------------ ends
 
     def stop(self, reason: str) -> None:
-        """End the run, drained."""
         self._thread.check_outside()
         self._end = self._end or (reason, _DRAIN_S, "")
         self._finish()
 
     def interrupt(self, reason: str, exit_code: int) -> None:
-        """End the run at once, with an exit code."""
         if not _Thread.turn.acquire(blocking=False):
             # A step that goes on in another thread ends before its next event.
             self._loop.interrupt(RunError(f"the run has ended: {reason}", exit_code))
@@ -276,12 +265,10 @@ class LocalRun:
             _Thread.turn.release()
 
     def wait(self) -> Run:
-        """What the run, which has ended, has left behind."""
         assert self._run is not None
         return self._run
 
     def last_packets(self, output: str) -> tuple[int, Sequence[Any]]:
-        """The packets of an output that were kept until the end."""
         node, _, port = output.partition(".")
         history = self._nodes[node].histories.by_output.get(port) if node in self._nodes else None
         return (history.count, [*history.packets]) if history is not None else (0, ())
@@ -618,10 +605,14 @@ class _Thread:
             except FileNotFoundError:  # it has been removed
                 path = ""
             if path != self._program_path or not path:
-                self._note_folder(path)
+                if self._program_folder >= 0:
+                    os.close(self._program_folder)
+                self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
+                self._program_path = path
             # A notebook exchanges the handler with each cell, so it is looked at after a pause.
-            if time.monotonic() - self._left_s > _CELL_S:
-                self._handle_interrupts()
+            is_later = time.monotonic() - self._left_s > _CELL_S
+            if is_later and _is_main() and _handler() is signal.default_int_handler:
+                signal.signal(signal.SIGINT, _Thread._on_interrupt)
             self._is_inside = True
             if threading.get_ident() == _MAIN:
                 self._is_interruptible = True
@@ -680,16 +671,6 @@ class _Thread:
         self._is_inside = False
         self.turn.release()
 
-    def _note_folder(self, path: str) -> None:
-        if self._program_folder >= 0:
-            os.close(self._program_folder)
-        self._program_folder = os.open(".", os.O_PATH | os.O_DIRECTORY)
-        self._program_path = path
-
-    def _handle_interrupts(self) -> None:
-        if _is_main() and _handler() is signal.default_int_handler:
-            signal.signal(signal.SIGINT, _Thread._on_interrupt)
-
     @staticmethod
     def _on_interrupt(number: int, frame: FrameType | None) -> None:
         loops = _Thread._interruptible
@@ -741,7 +722,6 @@ class _Watchdog:
         self.hang = ""
 
     def begin(self) -> None:
-        """Watch from now on."""
         self._thread.start()
 
     def end(self) -> None:

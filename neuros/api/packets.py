@@ -223,7 +223,6 @@ def may_have_lost(figures: Mapping[str, Any]) -> bool:
 
 
 def _is_in(numbers: Numbers, places: Numbers) -> Numbers:
-    """Which places, from 1, are inside of the numbers."""
     found: Numbers = (places >= 1) & (places <= len(numbers))
     return found
 

@@ -151,7 +151,6 @@ class Plan:
 
     @property
     def nodes(self) -> list[Node]:
-        """The nodes to start."""
         return [self.project.node(name) for name in self.names]
 
     @property
@@ -175,13 +174,7 @@ class Plan:
         return [*self.chosen.notices, *self.deployment.notices]
 
     @property
-    def nodes_here(self) -> list[Node]:
-        """The nodes to start on this machine."""
-        return [node for node in self.nodes if node.name not in self.places]
-
-    @property
     def is_partial(self) -> bool:
-        """Whether some nodes are not started."""
         return bool(self.elsewhere)
 
     @property
@@ -346,7 +339,8 @@ def check_machine(plan: Plan, environ: Mapping[str, str]) -> None:
     # A project may have been written for another machine: its cores are no mistake in it.
     problems = [
         f"{problem_in(node.file, f'{node.pointer}/affinity', text)}"
-        for node in plan.nodes_here
+        for node in plan.nodes
+        if node.name not in plan.places
         if plan.request.placement and (missing := set(node.affinity) - usable)
         for text in [f"node '{node.name}' asks for {_cores_in_words(missing)}"]
     ]
@@ -459,5 +453,4 @@ def make_environments(pythons: Pythons, messages: Messages | None, output: Strea
 
 
 def are_made(pythons: Pythons, messages: Messages | None) -> bool:
-    """Whether nothing is missing."""
     return pythons.is_made and (messages is None or messages.is_made)

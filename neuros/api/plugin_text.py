@@ -127,7 +127,14 @@ class PluginText:
         codes = (getattr(part, "__code__", None) for part in parts)
         if any(code and code.co_flags & annotations.compiler_flag for code in codes):
             self._imports.setdefault("__future__", {})["annotations"] = None
-            _remove_annotations(tree)
+            # Leave out annotations, which are not evaluated.
+            for node in ast.walk(tree):
+                if isinstance(node, ast.arg):
+                    node.annotation = None
+                elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                    node.returns = None
+                elif isinstance(node, ast.AnnAssign):
+                    node.annotation = ast.Constant(None)
         used, changed = globals_of(ast.unparse(tree))
         if set_here := sorted(changed & space.keys()):
             self._refuse(value, f"it sets the global {_quoted(set_here)}: keep it as user data")
@@ -316,17 +323,6 @@ def _is_plain(value: Any) -> bool:
     if type(value) in (tuple, frozenset):
         return all(map(_is_plain, value))
     return type(value) in _PLAIN and (not isinstance(value, float) or value - value == 0)
-
-
-def _remove_annotations(tree: ast.Module) -> None:
-    """Leave out annotations, which are not evaluated."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.arg):
-            node.annotation = None
-        elif isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            node.returns = None
-        elif isinstance(node, ast.AnnAssign):
-            node.annotation = ast.Constant(None)
 
 
 def _quoted(names: Sequence[str]) -> str:

@@ -388,7 +388,6 @@ class Project:
         return f"<Project {self.name}: {counts}; {self.file}>"
 
     def _prepared(self, options: StartOptions) -> LiveRun:
-        """A run that has not begun."""
         return self._live(*self._load_for_run(options), options)
 
     def _live(

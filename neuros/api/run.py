@@ -151,7 +151,6 @@ class Run(PastRun):
         return f"<Run of {self.project}: exit code {self.exit_code}, {self.reason}; {self.folder}>"
 
     def _repr_html_(self) -> str:
-        """For notebooks."""
         return f"<pre>{html.escape(str(self))}</pre>"
 
 

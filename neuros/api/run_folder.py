@@ -276,7 +276,6 @@ def recording_of(plan: Plan, environ: Mapping[str, str]) -> RecordingPlan | None
 
 
 def log_of(run: Path) -> Path:
-    """The log of the recorder."""
     return run / "recorder.log"
 
 

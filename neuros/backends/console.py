@@ -285,7 +285,6 @@ class NonBlockingWriter:
         return bool(self._unwritten)
 
     def write(self, text: str) -> None:
-        """Write, now or later."""
         if self._is_gone:
             return
         if self._descriptor is None:
@@ -378,7 +377,6 @@ class Progress:
 
     @property
     def has_end(self) -> bool:
-        """Whether the end of the run is known."""
         return self._wall_s is not None or self._end_sim_s is not None
 
     def text(self) -> str:

@@ -133,7 +133,6 @@ class Guardian:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
         return self._process.pid
 
     @property
@@ -297,7 +296,6 @@ class GuardedProcess:
 
     @property
     def is_there(self) -> bool:
-        """Whether the kernel has it."""
         return self._started is not None and started_at(self.pid) == self._started
 
     def poll(self) -> int | None:

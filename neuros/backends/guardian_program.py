@@ -65,7 +65,6 @@ class Orders:
         return min(self._started_s, time.time() - (time.monotonic() - self._monotonic_s))
 
     def add(self, order: str, value: Any) -> None:
-        """Remember an order."""
         match order:
             case "grace":
                 self.grace_s, self.is_finished = value, True

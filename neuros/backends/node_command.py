@@ -148,7 +148,6 @@ def node_folder(node: NodeFile) -> Path:
 
 
 def log_file(node: NodeFile) -> Path:
-    """The file for the output of a node."""
     return node_folder(node) / "node.log"
 
 

@@ -117,7 +117,6 @@ class ProcessLauncher:
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
     ) -> Sequence[RunningProcess]:
-        """Start the processes, all or none. Raises ``EnvironmentFault``."""
         started: list[RunningProcess] = []
         try:
             for process in self._processes(nodes, environment):
@@ -129,7 +128,6 @@ class ProcessLauncher:
         return started
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
-        """One line per process."""
         return [str(process) for process in self._processes(nodes, {})]
 
     def _processes(
@@ -175,7 +173,6 @@ class RunningProcess:
         self.pid = self._process.pid
 
     def poll(self) -> str | None:
-        """``None`` while it runs, then how it ended, in words."""
         code = self._process.poll()
         if code is None:
             return None
@@ -195,11 +192,9 @@ class RunningProcess:
         self._process.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
-        """Kill it and its whole process group."""
         self._process.send_signal(signal.SIGKILL, is_for_group=True)
 
     def threads(self) -> ProcessThreads:
-        """The Python stacks of its threads."""
         read = threads_of(self.pid)
         return read if self.poll() is None else ProcessThreads()
 

@@ -35,7 +35,6 @@ class RunProcesses:
         self._mark = f"{RUN_ID}={run_id}".encode()
 
     def alive(self) -> list[int]:
-        """Process ids."""
         others = (int(name) for name in _numbers() if int(name) != os.getpid())
         return [pid for pid in others if self._mark in environ_of(pid) and started_at(pid)]
 

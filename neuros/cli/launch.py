@@ -39,7 +39,6 @@ _REMEDY = (
 
 
 def add_launch(launch: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     launch.description = "Run a project: start its nodes, connect them, wait until all have ended."
     launch.epilog = EXIT_CODES
     add_project(launch, LaunchOptions)

@@ -43,7 +43,6 @@ _LIVES_S = 1.0
 
 
 def add_ps(ps: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     ps.description = (
         "Show the nodes of all runs of this user on this machine; for root, of all users."
     )
@@ -62,7 +61,6 @@ def add_ps(ps: argparse.ArgumentParser) -> None:
 
 
 def add_stop(stop: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     stop.description = (
         "Stop runs of this user, as Ctrl+C in their terminal does, and wait until they have ended."
         " Root can stop a run of another user, but only by its id."
@@ -224,7 +222,6 @@ class _Topic:
 
 
 def add_topic(topic: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     topic.description = (
         "List the topics of a run in progress, show the packets of a topic, or count them. This"
         " needs no installation of ROS 2, and works with every back end."
@@ -392,7 +389,6 @@ def _named(topics: Sequence[_Topic], wanted: str) -> _Topic:
 
 
 def add_logs(logs: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     logs.description = "Show the log records of all nodes of a run, in the order of time."
     logs.add_argument("run", metavar="RUN", help=f"a run folder; or, for a run in progress, {_RUN}")
     logs.add_argument(

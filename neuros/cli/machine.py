@@ -38,7 +38,6 @@ exit codes:
 
 
 def add_build(build: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     build.description = (
         "Build the message packages of a workspace, and NeuROS's own, where they are not built"
         " yet. `neuros launch` does that, too."
@@ -95,7 +94,6 @@ def _build(options: argparse.Namespace) -> int:
 
 
 def add_containers(containers: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     containers.description = "Build, list and remove the images that nodes run in."
     containers.epilog = _CONTAINERS_EPILOG
     actions = containers.add_subparsers(title="actions", metavar="ACTION", required=True)
@@ -241,7 +239,6 @@ def _file_or_folder(text: str | None, option: str, *, is_folder: bool) -> Path |
 
 
 def add_doctor(doctor: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     doctor.description = (
         "Check that this machine has what runs need, then send packets between two nodes on each"
         " back end of this machine, to prove that they arrive."
@@ -289,12 +286,10 @@ _OPTIONS = "benchmarks.options"
 
 
 def add_benchmark(benchmark: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     _add_options(benchmark, "add_benchmark")
 
 
 def add_reproduce(reproduce: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     _add_options(reproduce, "add_reproduce")
 
 

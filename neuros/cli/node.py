@@ -28,7 +28,6 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
 
 
 def add_node(node: argparse.ArgumentParser) -> None:
-    """Add the arguments of the program; ``launch`` starts it, in a container or a process."""
     node.add_argument("node_files", nargs="+")
     node.add_argument("--transport", default="ros")
     node.add_argument("--one-process", action="store_true")

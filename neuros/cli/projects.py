@@ -35,7 +35,6 @@ _GRAPH_SUFFIXES = {".svg": "svg", ".mmd": "mermaid", ".mermaid": "mermaid"}
 
 
 def add_validate(validate: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     validate.description = (
         "Check a project and list every problem with its file, line and column. Plugins are read,"
         " but not run."
@@ -84,7 +83,6 @@ def _validate(parsed: argparse.Namespace) -> int:
 
 
 def add_import_plugin(command: argparse.ArgumentParser) -> None:
-    """Add the arguments of the program that ``validate --import`` runs for each node."""
     command.add_argument("name")
     command.add_argument("project")
     command.add_argument("--set", action="append", default=[])
@@ -106,7 +104,6 @@ def _import_plugin(options: argparse.Namespace) -> int:
 
 
 def add_graph(graph: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     graph.description = "Show the nodes and connections of a project without running it."
     add_project(graph)
     graph.add_argument(
@@ -122,7 +119,6 @@ def add_graph(graph: argparse.ArgumentParser) -> None:
 
 
 def add_types(types: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     types.description = (
         "Write stubs of the message classes that a project uses, so that editors complete the"
         " fields of packets, and mypy and Pyright check them."
@@ -181,7 +177,6 @@ _IN_GALLERY = re.compile(r"^## \[.*\]\((.*)/README\.md\)\n\n([^.]*\.(?=\s))", re
 
 
 def add_new(new: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     new.description = (
         "Make a folder with a small project that runs: two plugins in a closed loop, and a test;"
         " or a robot of yours in MuJoCo, with drives and sensors, and a brain that moves it."
@@ -237,7 +232,6 @@ def _new(options: argparse.Namespace) -> int:
 
 
 def add_example(example: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     example.description = (
         "List the examples, or copy one into a folder, where it can be run and changed."
     )

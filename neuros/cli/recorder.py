@@ -31,7 +31,6 @@ _ORPHANED_S = 4.0
 
 
 def add_recorder(recorder: argparse.ArgumentParser) -> None:
-    """Add the arguments of the program, which ``launch`` starts."""
     recorder.add_argument("run")
     recorder.set_defaults(command=_run_recorder)
 

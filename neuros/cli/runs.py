@@ -21,7 +21,6 @@ EXIT_CONSUMED = 6
 
 
 def add_verify(verify: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     verify.description = (
         "Say whether two runs carried the same packets. If not, name the first difference:"
         " connection, packet and, if both runs were recorded, field. For a run that was started"
@@ -102,7 +101,6 @@ _A_BAG = "the run folder, or a bag: a folder, .mcap or .db3, compressed or not"
 
 
 def add_bag(bag: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     bag.description = (
         "Show what a bag has, of a run or of another program; convert it; or complete the bag of a"
         " run that was cut off."

@@ -62,11 +62,9 @@ class ControlLink:
         self._received = bytearray()  # of a message whose end has not arrived
 
     def accept(self, accepted: Sequence[type[Message]]) -> None:
-        """Accept these messages, and no others, from now on."""
         self._decoder = decoder_of(tuple(accepted))
 
     def fileno(self) -> int:
-        """For selectors."""
         return self.stream.fileno()
 
     def send(self, message: Message) -> bool:
@@ -131,7 +129,6 @@ class ControlLink:
         return decode(data, self._decoder, self.peer)
 
     def close(self) -> None:
-        """Hang up."""
         self.stream.close()
 
 
@@ -149,11 +146,9 @@ class Arrivals:
         self._slept = self._to_sleep = 0
 
     def register(self, stream: Any) -> None:
-        """Wait for this one, too."""
         self._poll.register(stream, select.POLLIN)
 
     def unregister(self, stream: Any) -> None:
-        """Wait for it no more."""
         self._poll.unregister(stream)
 
     def wait(self, timeout_ms: float | None) -> list[int]:

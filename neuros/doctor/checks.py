@@ -161,7 +161,6 @@ def _gpu() -> Finding:
 
 
 def installed(subject: str, distribution: str, remedy: str) -> Finding:
-    """The version of a distribution, or its absence."""
     try:
         return Finding.good(subject, f"{distribution} {metadata.version(distribution)}")
     except metadata.PackageNotFoundError:

@@ -170,7 +170,6 @@ class Engine:
             self._pass()
 
     def on_registered(self, connection: Connection) -> None:
-        """The receiver of one of the outputs' connections is there."""
         self._wake()
         self._lifecycle.register(connection)
         self._pass()
@@ -277,7 +276,6 @@ class Engine:
 
     @property
     def is_started(self) -> bool:
-        """Whether :meth:`start` was called."""
         return self._lifecycle.is_started
 
     @property

@@ -176,7 +176,6 @@ class LoggedEngine(Engine):
 
 
 def entry_of(kind: EventKind, place: int = 0, position: int = 0) -> int:
-    """The entry of an event."""
     return ~(kind | place << _KIND_BITS | position << _POSITION_SHIFT)
 
 

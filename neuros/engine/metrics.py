@@ -91,7 +91,6 @@ class TickIntervals:
         self._bins: Counter[int] = Counter()
 
     def record(self, start_ns: int) -> None:
-        """The hook starts."""
         last_ns, self._last_ns = self._last_ns, start_ns
         if last_ns is None:
             return
@@ -171,7 +170,6 @@ class TimeBudget:
 
     @property
     def executing_s(self) -> float:
-        """Seconds of all hooks."""
         return sum(self.executing.values())
 
     @property
@@ -186,7 +184,6 @@ class TimeBudget:
 
     @property
     def total_s(self) -> float:
-        """The sum."""
         rest = sum(self.waiting.values()) + sum(self.blocked.values()) + self.idle_s
         return self.own_s + rest
 

@@ -183,7 +183,6 @@ class Lifecycle:
         self._run_if_initialised()
 
     def register(self, connection: Connection) -> None:
-        """The receiver of one of the outputs' connections is there."""
         window = self._windows[connection]
         if not window.is_registered:
             window.is_registered = True
@@ -276,7 +275,6 @@ class Pause:
         self.revoke()
 
     def revoke(self) -> None:
-        """Revoke the steps that are left."""
         self._granted = 0
         self._started.clear()
         self.is_still = self._lifecycle.is_running and self._still_since_ns is not None
@@ -374,7 +372,6 @@ class ExecutionLog:
         self.credits = array("q")
 
     def record_execution(self, hook: Hook, start_ns: int, end_ns: int) -> None:
-        """Record an execution of a hook."""
         place = self._places.get(hook)
         if place is None:
             place = self._places[hook] = len(self.hooks)
@@ -384,5 +381,4 @@ class ExecutionLog:
         self.is_full = self._left <= 0
 
     def record_credit(self, connection: Connection, position: int, now_ns: int) -> None:
-        """Record an acknowledgement."""
         self.credits.extend((connection.index, position, now_ns))

@@ -283,7 +283,6 @@ class Environment:
 
     @property
     def python(self) -> Path:
-        """The Python in it."""
         return self.folder / "bin" / "python"
 
     def install(self) -> None:

@@ -28,7 +28,6 @@ class Progress:
         self._start = self._last = time.monotonic()
 
     def step(self, text: str) -> None:
-        """Show a step that begins."""
         self._last = time.monotonic()
         self._write(f"{self._line(text)}\n")
 

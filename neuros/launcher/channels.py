@@ -87,12 +87,10 @@ class Channels:
                 yield from self._read(link)
 
     def send(self, message: Message) -> None:
-        """Send to all node processes."""
         for link in tuple(self._nodes):
             self.send_to(link, message)
 
     def send_to_node(self, name: str, message: Message) -> None:
-        """Send to the process of one node."""
         for link, names in tuple(self._nodes.items()):
             if name in names:
                 self.send_to(link, message)
@@ -104,7 +102,6 @@ class Channels:
 
     @property
     def process_count(self) -> int:
-        """How many node processes have said hello."""
         return len(self._nodes)
 
     def send_to(self, link: ControlLink, message: Message) -> None:
@@ -126,7 +123,6 @@ class Channels:
         return self._nodes.get(link, ())
 
     def has(self, link: ControlLink) -> bool:
-        """Whether that one is still connected."""
         return link in self._links
 
     def flush(self) -> None:
@@ -135,14 +131,12 @@ class Channels:
             link.flush()
 
     def hang_up(self, link: ControlLink) -> None:
-        """Close the connection."""
         if link in self._links:
             del self._links[link]
             self._selector.unregister(link)
             link.close()
 
     def close(self) -> None:
-        """Hang up on all."""
         for link in tuple(self._links):
             self.hang_up(link)
         self._selector.close()
@@ -203,7 +197,6 @@ class PauseState:
 
     @property
     def is_on(self) -> bool:
-        """Whether the run is paused now."""
         return self.since_s is not None
 
     @property
@@ -212,13 +205,11 @@ class PauseState:
         return self._before_s + (0.0 if self.since_s is None else self.clock() - self.since_s)
 
     def begin(self) -> None:
-        """Pause all nodes."""
         if self.since_s is None:
             self.since_s = self.clock()
             self.send(control.Pause())
 
     def end(self) -> None:
-        """Resume all nodes."""
         if self.since_s is not None:
             self.forget()
             self.send(control.Resume())
@@ -297,7 +288,6 @@ class Observers:
                 self._end(reason)
 
     def tell(self, message: Message) -> None:
-        """Send to all observers."""
         for link in self._links.values():
             self._channels.send_to(link, message)
 

@@ -109,7 +109,6 @@ class NodeView:
         self.advance(now_s)
 
     def advance(self, now_s: float) -> None:
-        """It has made progress."""
         self._moved_s = now_s
 
     def left_s(self, now_s: float) -> float:
@@ -144,7 +143,6 @@ class NodeView:
 
 
 def finalising(nodes: Sequence[NodeView]) -> NodeView | None:
-    """The node of a process that finalises now."""
     return next((node for node in nodes if node.hook is not None), None)
 
 

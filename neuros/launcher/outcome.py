@@ -194,7 +194,6 @@ def _simulated(timeline: Sequence[Sequence[float]], wall_s: float) -> float:
 
 
 def names_of(process: RunningNode) -> str:
-    """Its nodes, for people."""
     return " and ".join(f"'{name}'" for name in process.names)
 
 

@@ -75,7 +75,6 @@ class PeerState:
     received: Ends = field(default_factory=dict)
 
     def to_text(self) -> str:
-        """As it travels."""
         return json.dumps(asdict(self))
 
     @property
@@ -85,7 +84,6 @@ class PeerState:
 
     @property
     def is_ending(self) -> bool:
-        """Whether the end has been asked for."""
         return self.phase != RUNNING
 
 
@@ -164,7 +162,6 @@ class Peers:
 
     @property
     def exist(self) -> bool:
-        """Whether there are any."""
         return bool(self._elsewhere)
 
     @property
@@ -182,7 +179,6 @@ class Peers:
         return not self._behind(stage)
 
     def drain(self, reason: str, drain_s: float) -> None:
-        """The run here drains."""
         self._publish(phase=DRAINING, drain_s=drain_s, **self._because(reason, 0))
 
     def agree_on_end(self, probes: Mapping[str, NodeProbe]) -> bool:
@@ -206,7 +202,6 @@ class Peers:
             self._publish(phase=DRAINING)
 
     def stop(self, exit_code: int, reason: str) -> None:
-        """The run here stops."""
         self._publish(phase=STOPPING, **self._because(reason, exit_code))
 
     def finish(self, reports: Mapping[str, Report], now_s: float) -> bool:
@@ -239,7 +234,6 @@ class Peers:
             self._others[state.run] = state
 
     def end(self, now_s: float) -> EndElsewhere | None:
-        """The end of the project elsewhere, if there is one."""
         for node, gone_s in self._gone_s.items():
             state = self._others[self._run_of[node]]
             if not state.is_ending and now_s - gone_s >= _GRACE_S:

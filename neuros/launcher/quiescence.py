@@ -21,16 +21,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from enum import Enum
 from typing import Any, TypeVar
 
-from neuros.control import (
-    Advance,
-    AtRest,
-    HookDeclaration,
-    Hooks,
-    Message,
-    NodeProbe,
-    Probe,
-    Probed,
-)
+import neuros.control as control
 from neuros.hooks import HookKind, InputSpec
 from neuros.launcher.peers import Peers
 from neuros.project.model import Connection, NodeFile
@@ -44,7 +35,7 @@ _LOST_AFTER_S = 0.1
 
 _T = TypeVar("_T")
 
-Probes = Mapping[str, NodeProbe]
+Probes = Mapping[str, control.NodeProbe]
 """The newest probe by node."""
 
 Waits = Mapping[str, Mapping[str, str]]
@@ -90,7 +81,7 @@ class Probing:
         self,
         names: Iterable[str],
         connections: Sequence[Connection],
-        send: Callable[[Message], object],
+        send: Callable[[control.Message], object],
         peers: Peers | None = None,
         are_there: Callable[[], bool] = lambda: True,
     ) -> None:
@@ -104,11 +95,11 @@ class Probing:
         self._asked_s = 0.0
         self._next_s = 0.0  # infinite while answers are awaited
         self._pause_s = 0.0
-        self._probes: dict[str, NodeProbe] = {}
+        self._probes: dict[str, control.NodeProbe] = {}
         self._answers: Probes = {}  # of the last whole round
         self._last_round: tuple[Any, ...] | None = None
         self._same_since_s = 0.0
-        self._step = Advance(0, 0, {})
+        self._step = control.Advance(0, 0, {})
         self._packets: dict[str, tuple[int, list[bytes]]] = {}
         self.verdict = Verdict.UNDECIDED
 
@@ -123,23 +114,23 @@ class Probing:
         if not self._names:
             self.verdict = Verdict.DRAINED
 
-    def await_rest(self, step: Advance, now_s: float) -> None:
+    def await_rest(self, step: control.Advance, now_s: float) -> None:
         """Find out when a step is over; what was asked before is answered no more."""
         if self._goal is not Verdict.DRAINED:
             self._step = step
             self._packets = {}
             self._seek(Verdict.AT_REST, now_s)
 
-    def end_rest(self) -> AtRest:
+    def end_rest(self) -> control.AtRest:
         """The answer to the session, once it is at rest or waits for that no more."""
         nodes = self._answers.items()
         times = {name: probe.sim_time for name, probe in nodes if probe.sim_time is not None}
         if self._goal is Verdict.AT_REST:
             self._goal, self._pause_s, self._last_round = Verdict.DEAD, 0.0, None
             self.verdict = Verdict.UNDECIDED
-        return AtRest(self._step.number, times, self._packets)
+        return control.AtRest(self._step.number, times, self._packets)
 
-    def add(self, probed: Probed, now_s: float) -> None:
+    def add(self, probed: control.Probed, now_s: float) -> None:
         """An answer of a process has arrived, perhaps to the last round."""
         if probed.number != self._number:
             return
@@ -210,7 +201,7 @@ class Probing:
         self._probes = {}
         newest = {output: number for output, (number, _) in self._packets.items()}
         known = {**self._step.known, **newest} if is_step else {}
-        self._send(Probe(self._number, once_idle=is_step, known=known))
+        self._send(control.Probe(self._number, once_idle=is_step, known=known))
 
     def _wait(self, now_s: float) -> None:
         first_s, longest_s = _PAUSES_S[self._goal]
@@ -373,7 +364,7 @@ def _ends(
                 yield connection, sender.sent[key], receiver.received[key]
 
 
-class DeclaredHook(HookDeclaration, frozen=True):
+class DeclaredHook(control.HookDeclaration, frozen=True):
     """A hook as its plugin declares it; ``place`` is that among the hooks of its node's engine."""
 
     node: str = ""
@@ -407,7 +398,7 @@ class Declarations:
         }
         self._hooks: dict[str, list[DeclaredHook]] = {}
 
-    def add(self, message: Hooks) -> None:
+    def add(self, message: control.Hooks) -> None:
         """Keep the declarations of a node, in the place of those before its reset."""
         node = message.node
         self._hooks[node] = [

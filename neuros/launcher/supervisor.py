@@ -36,8 +36,7 @@ from neuros.launcher.outcome import (
 )
 from neuros.launcher.peers import EndElsewhere, Peers, Stage
 from neuros.launcher.quiescence import Declarations, Probing, Verdict, connections_among
-from neuros.launcher.stall_detector import SILENT_S, Backlog, StallDetector
-from neuros.launcher.thread_reader import ThreadReader
+from neuros.launcher.stall_detector import SILENT_S, Backlog, StallDetector, ThreadReader
 from neuros.ports import ControlListener, Launcher, RunningNode
 from neuros.project.model import NodeFile
 
@@ -230,7 +229,6 @@ class Supervisor:
         self._handle(RunEvent.FAILURE)
 
     def _log(self, severity: str, text: str) -> None:
-        """Log for the user and the observers."""
         self._output.log(severity, text)
         self.observers.tell(control.LogRecord(severity, text))
 

@@ -88,7 +88,6 @@ def describe(order: Order) -> None:
 
 
 def generate(order: Order) -> None:
-    """Run all generators."""
     from rosidl_generator_c import generate_c
     from rosidl_generator_py import generate_py
     from rosidl_typesupport_c import generate_c as generate_dispatch

@@ -63,7 +63,6 @@ class Messages:
 
     @property
     def built(self) -> list[Built]:
-        """Each package, built or not."""
         return [build.built for build in self._builds]
 
     @property
@@ -73,7 +72,6 @@ class Messages:
 
     @property
     def is_made(self) -> bool:
-        """Whether everything is built."""
         return all(built.is_there for built in self.built)
 
     @property
@@ -326,7 +324,6 @@ class _Builder:
         self._link(self.compilers.c, out, inputs, options, "$ORIGIN/../../lib")
 
     def _object(self, source: Path) -> Path:
-        """Compile a file."""
         out = source.with_suffix(f"{source.suffix}.o")
         include = self.workspaces.ros.include
         own = [self._generated(kind).parent for kind in _HEADERS]

@@ -51,7 +51,6 @@ class Package:
 
     @property
     def messages(self) -> set[str]:
-        """The names of its messages."""
         return {file.stem for file in self.files if file.suffix == ".msg"}
 
     @property
@@ -220,7 +219,6 @@ class Ros:
         return self.prefix / "share" / package
 
     def has(self, package: str) -> bool:
-        """Whether a package is installed."""
         # Path.is_file() raises for a name that is too long.
         return os.path.isfile(self.share(package) / MANIFEST)
 
@@ -231,7 +229,6 @@ class Ros:
         return {file.stem for file in self.share(package).glob("msg/*.idl")}
 
     def message_packages(self) -> set[str]:
-        """The packages that have messages."""
         return {folder.parent.name for folder in (self.prefix / "share").glob("*/msg")}
 
     def manifest(self, package: str) -> bytes:

@@ -87,7 +87,6 @@ class Workspaces:
 
     @cached_property
     def packages(self) -> dict[str, Package]:
-        """All packages, by name."""
         return {**self._shared.packages, **self._own.packages}
 
     @property
@@ -209,7 +208,6 @@ def _find(folder: Path | None) -> _Found:
 
 
 def cycle_problem(workspaces: Workspaces, error: CycleError) -> Problem:
-    """The problem of packages that need each other."""
     names: list[str] = error.args[1]
     package = workspaces.packages[names[0]]
     text = f"found packages that need each other: {' -> '.join(names)}"
@@ -227,12 +225,10 @@ class Built(Kept):
 
     @property
     def package(self) -> str:
-        """The name of the package."""
         return self.folder.name[: -KEY_LENGTH - 1]
 
     @property
     def python(self) -> Path:
-        """The folder for Python's path."""
         return self.folder / "python"
 
     @property

@@ -51,7 +51,6 @@ class Context:
         self.log_fd = log_fd
 
     def close(self) -> None:
-        """Close the log file."""
         if self.log_fd is not None:
             os.close(self.log_fd)
 
@@ -132,7 +131,6 @@ class ContextSwitch:
         return context
 
     def enter(self, context: Context) -> None:
-        """Put ``context`` in place."""
         current = self.current
         if current is context:
             return

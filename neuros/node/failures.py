@@ -35,7 +35,6 @@ class Failures:
         self._fail = fail
 
     def report(self, error: BaseException) -> None:
-        """End the project with an error."""
         self._fail(self._name, error if isinstance(error, NeurosError) else as_node_error(error))
 
     def report_callback(self, callback: Any, error: BaseException) -> None:

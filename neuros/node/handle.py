@@ -12,13 +12,13 @@ from typing import Any, TypeAlias
 
 from neuros.engine.engine import Engine
 from neuros.errors import ModelError, NodeError
-from neuros.node.copies import copy_seeds
 from neuros.node.failures import Failures, as_node_error
 from neuros.node.keeping import Keeping
 from neuros.node.simulated_time import SimulatedTime
 from neuros.node.virtual import VirtualTime, refuse_thread
+from neuros.ordinary_files import write_whole
 from neuros.ports import Advance, Logger, NodeEvents, Packets, WorldLook
-from neuros.project.model import Node, NodeFile
+from neuros.project.model import SEEDS, Node, NodeFile
 from neuros.project.suggest import did_you_mean
 
 _POLL_S = 0.05
@@ -195,7 +195,23 @@ class NodeHandle:
         Raises:
             NodeError: if the node has no such variable, several, or one that is no whole number.
         """
-        return copy_seeds(self.name, self._file.node.environment, self.copies)
+        if given := os.environ.get(SEEDS):
+            found: list[int] = json.loads(given)
+            return found
+        names = [name for name in self._file.node.environment if "SEED" in name.upper()]
+        if len(names) != 1:
+            has = f"several: {', '.join(names)}" if names else "none"
+            raise NodeError(
+                f"seeds: node '{self.name}' needs one variable with SEED in its name in its"
+                f" environment, and has {has}"
+            )
+        text = os.environ.get(names[0], "")
+        if not (text.isascii() and text.isdigit()):
+            raise NodeError(f"seeds: {names[0]}={text!r} is no whole number from 0 on")
+        from numpy.random import SeedSequence
+
+        sequences = (SeedSequence(int(text), spawn_key=(index,)) for index in range(self.copies))
+        return [int(each.generate_state(1, "uint64")[0]) for each in sequences]
 
     @property
     def sim_time(self) -> float | None:
@@ -487,7 +503,6 @@ class Results:
         self._values: dict[str, Any] = {}
 
     def clear(self) -> None:
-        """Forget all."""
         self._values = {}
         self._file.unlink(missing_ok=True)
 
@@ -497,9 +512,7 @@ class Results:
         is_finite = not isinstance(value, float) or math.isfinite(value)
         values = {**self._values, str(name): value if is_finite else None}
         text = json.dumps(values, indent=2, default=_plain, allow_nan=False)
-        new = self._file.with_suffix(".new")
-        new.write_text(text + "\n", "utf-8")
-        os.replace(new, self._file)  # a reader never finds half of it
+        write_whole(self._file, f"{text}\n".encode())
         self._values = values
 
 

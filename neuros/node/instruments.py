@@ -37,11 +37,9 @@ class Passage:
         self.observers: tuple[Observe, ...] = ()
 
     def add(self, observe: Observe) -> None:
-        """Have one more called."""
         self.observers = (*self.observers, observe)
 
     def remove(self, observe: Observe) -> None:
-        """Have one called no more."""
         self.observers = tuple(each for each in self.observers if each is not observe)
 
 

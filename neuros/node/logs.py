@@ -78,18 +78,15 @@ class _List:
             if not self._room:
                 if self._keeps_first:
                     return
-                self._begin_file()
+                if len(self._files) == _FILES:
+                    self._files.pop(0).unlink(missing_ok=True)
+                self._files.append(self._file.with_name(f"{self._file.name}.{self._written // 8}"))
+                self._room = self._file_bytes
             part, data = data[: self._room], data[self._room :]
             with open(self._files[-1], "ab") as file:
                 file.write(part)
             self._room -= len(part)
             self._written += len(part)
-
-    def _begin_file(self) -> None:
-        if len(self._files) == _FILES:
-            self._files.pop(0).unlink(missing_ok=True)
-        self._files.append(self._file.with_name(f"{self._file.name}.{self._written // 8}"))
-        self._room = self._file_bytes
 
 
 class PacketLog:

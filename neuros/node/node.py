@@ -202,7 +202,6 @@ class NodeRuntime:
 
     @property
     def has_context(self) -> bool:
-        """Whether the context of this node is in place now."""
         return self._contexts.current is self._context
 
     @property
@@ -390,7 +389,13 @@ class NodeRuntime:
                 self._guard(partial(self.keeping.save, name))
         self._tell(Finalising(self.name, ""))
         if self._is_held and not self._is_local:
-            self._save_packets()
+            # Leave the newest packets for a session, which may want to see what led to the end.
+            packets = {
+                f"{self.name}.{output}": (history.count, history.newest(_MOST_SAVED_BYTES))
+                for output, history in self.histories.by_output.items()
+            }
+            with suppress(OSError):  # a full disk is reported by what loses more by it
+                (self.run_dir / LAST_PACKETS).write_bytes(to_bytes(AtRest(0, {}, packets)))
         if self._recorder is not None:
             self._recorder.close()
         note_arithmetic(self.run_dir)
@@ -400,7 +405,6 @@ class NodeRuntime:
     # ------------------------------------------------------------------ inbox
 
     def on_packet(self, connection: Connection, packet: Any) -> None:
-        """A packet has arrived on a connection."""
         if self._arrivals and (passage := self._arrivals.get(connection)) is not None:
             for observe in passage.observers:
                 observe(packet, None)
@@ -410,7 +414,6 @@ class NodeRuntime:
             self.failures.report(error)
 
     def on_external_packet(self, port: Port, packet: Any) -> None:
-        """A packet has arrived on an external topic."""
         for observe in self._heard[port.name].observers:
             observe(packet, None)
         try:
@@ -438,14 +441,12 @@ class NodeRuntime:
     def on_acknowledgement(
         self, connection: Connection, position: int, arrival_ns: int | None = None
     ) -> None:
-        """The receiver of a connection has started on packets."""
         try:
             self.loaded.on_acknowledgement(connection, position, arrival_ns)
         except NeurosError as error:
             self.failures.report(error)
 
     def on_registered(self, connection: Connection) -> None:
-        """The receiver of a connection is there."""
         self._guard(lambda: self.loaded.on_registered(connection))
 
     def on_timer(self) -> None:
@@ -477,7 +478,6 @@ class NodeRuntime:
         self.specs = self._plugin = with_clocks(node, specs)
 
     def _make(self) -> Engine:
-        """The engine for the hooks of now."""
         node = self.file.node
         packets = self._middleware.packets
         jpegs = {
@@ -518,15 +518,6 @@ class NodeRuntime:
         """Put what waits into values that were kept, once all initialise hooks have run."""
         if not self._uninitialised:
             self.keeping.restore_waiting()
-
-    def _save_packets(self) -> None:
-        """Leave the newest packets for a session, which may want to see what led to the end."""
-        packets = {
-            f"{self.name}.{output}": (history.count, history.newest(_MOST_SAVED_BYTES))
-            for output, history in self.histories.by_output.items()
-        }
-        with suppress(OSError):  # a full disk is reported by what loses more by it
-            (self.run_dir / LAST_PACKETS).write_bytes(to_bytes(AtRest(0, {}, packets)))
 
     def _finalise_hooks(self, begin: Callable[[str], object] = lambda _: None) -> None:
         for spec in self.specs:

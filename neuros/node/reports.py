@@ -7,15 +7,7 @@ from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
-from neuros.control import (
-    HookDeclaration,
-    Hooks,
-    LiveCounters,
-    Metrics,
-    NodeProbe,
-    NodeStatus,
-    Report,
-)
+import neuros.control as control
 from neuros.engine.engine import Engine
 from neuros.engine.metrics import State
 from neuros.engine.snapshot import explain, snapshot, steadily
@@ -71,7 +63,6 @@ class NodeReports:
         self._has_begun = True
 
     def begin_anew(self, engine: Engine) -> None:
-        """The node was reset, and has this engine now."""
         self._engine = engine
         if self._packet_log is not None:
             self._packet_log.begin_anew(engine)
@@ -89,9 +80,9 @@ class NodeReports:
         if self._world_log is not None and self._sampler.look_at_world is not None:
             self._world_log.write(self._sampler.look_at_world)
 
-    def report(self, *, is_final: bool = False) -> Report:
+    def report(self, *, is_final: bool = False) -> control.Report:
         """State and counters. Any thread."""
-        return Report(**self._state(), is_final=is_final)
+        return control.Report(**self._state(), is_final=is_final)
 
     def _state(self) -> dict[str, Any]:
         now_ns, engine = self._clock(), self._engine
@@ -131,7 +122,7 @@ class NodeReports:
                 return f"node '{self._file.node.name}': {part.failure}"
         return None
 
-    def status(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> NodeStatus:
+    def status(self, wanted: Mapping[str, Mapping[str, Any]], asker: int) -> control.NodeStatus:
         """What an observer is shown: the node, and what was sampled of its packets. Any thread.
 
         Args:
@@ -139,7 +130,7 @@ class NodeReports:
             asker: the number of the observer.
         """
         engine = self._engine
-        return NodeStatus(
+        return control.NodeStatus(
             self._file.node.name,
             asker,
             self._time.now_s,
@@ -148,7 +139,7 @@ class NodeReports:
             self._keeps(),
         )
 
-    def probe(self, *, is_idle: bool, has_free_threads: bool) -> NodeProbe:
+    def probe(self, *, is_idle: bool, has_free_threads: bool) -> control.NodeProbe:
         """Where the node stands between two events. Loop thread only.
 
         A thread of a plugin may submit packets, or end the project, at any time.
@@ -162,7 +153,7 @@ class NodeReports:
             or (not engine.is_stopped and self._middleware.has_foreign_entities(self._file))
         )
         at_rest = self.probe_at_rest(())
-        return NodeProbe(
+        return control.NodeProbe(
             sent=at_rest.sent,
             received=at_rest.received,
             sim_time=at_rest.sim_time,
@@ -176,14 +167,14 @@ class NodeReports:
             is_virtual=self._file.time == VIRTUAL,
         )
 
-    def probe_at_rest(self, here: Container[str]) -> NodeProbe:
+    def probe_at_rest(self, here: Container[str]) -> control.NodeProbe:
         """Where the node stands at the end of a step, when no event waits. Loop thread only.
 
         Connections with the nodes ``here`` are left out: nothing is under way on them then.
         """
         engine = self._engine
         assert engine is not None
-        return NodeProbe(
+        return control.NodeProbe(
             sent={
                 str(window.connection): (window.sent, window.acknowledged)
                 for window in engine.send_windows.values()
@@ -199,12 +190,14 @@ class NodeReports:
         )
 
 
-def declared(node: str, specs: Sequence[HookSpec]) -> Hooks:
+def declared(node: str, specs: Sequence[HookSpec]) -> control.Hooks:
     """The hooks of a node, as the supervisor needs them."""
-    return Hooks(
+    return control.Hooks(
         node,
         tuple(
-            HookDeclaration(spec.kind, spec.inputs, tuple(port.name for port in spec.outputs))
+            control.HookDeclaration(
+                spec.kind, spec.inputs, tuple(port.name for port in spec.outputs)
+            )
             for spec in specs
             if spec.is_scheduled
         ),
@@ -212,7 +205,7 @@ def declared(node: str, specs: Sequence[HookSpec]) -> Hooks:
     )
 
 
-def live_counters(engine: Engine, now_ns: int) -> LiveCounters:
+def live_counters(engine: Engine, now_ns: int) -> control.LiveCounters:
     """Counters and latest times of a node. Any thread.
 
     Times lack the connections whose packet log has just been written out.
@@ -223,9 +216,9 @@ def live_counters(engine: Engine, now_ns: int) -> LiveCounters:
             del hook[figure]
     no_sent: dict[str, tuple[int, tuple[int, ...]]] = {}
     no_taken: dict[str, tuple[int, int]] = {}
-    return LiveCounters(
+    return control.LiveCounters(
         now_ns / 1e9,
-        cast(Metrics, metrics),
+        cast(control.Metrics, metrics),
         steadily(lambda: _sent(engine), no_sent),
         steadily(lambda: _taken(engine), no_taken),
         steadily(lambda: tuple(engine.pauses.last_still_ns), ()),

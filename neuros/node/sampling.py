@@ -371,18 +371,14 @@ def _walk(value: Any, path: str, most: int) -> Iterator[tuple[str, Any]]:
         yield path, value
     elif hasattr(value, "__len__"):
         yield f"{path}.length", len(value)
-        yield from _elements(value, path, most)
+        for place, each in enumerate(value[:most]):
+            yield from _walk(each, f"{path}[{place}]", most)
     else:
         try:
             number = float(value)
         except (TypeError, ValueError):
             return
         yield path, number if math.isfinite(number) else str(number)
-
-
-def _elements(values: Sequence[Any], path: str, most: int) -> Iterator[tuple[str, Any]]:
-    for place, each in enumerate(values[:most]):
-        yield from _walk(each, f"{path}[{place}]", most)
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,6 @@ def mistakes(parsed: ParsedProject) -> list[Problem]:
 
 
 def _ports_of(node: Element) -> Iterator[tuple[Element, Side]]:
-    """Every port of a node, with its side."""
     for side in _SIDES:
         for port in node.items(side):
             yield port, side
@@ -222,7 +221,6 @@ def _compression(connection: Element, types: list[str]) -> Iterator[Problem]:
 
 
 def unconnected_ports(parsed: ParsedProject) -> Iterator[Problem]:
-    """Ports that nothing is connected to."""
     used = {
         (side, connection.string(node), connection.string(port))
         for connection in parsed.connections

@@ -72,7 +72,6 @@ def port_names(connection: Connection) -> str:
 
 
 def guarantee(connection: Connection) -> str:
-    """The guarantee of a connection, in words."""
     if connection.discard_limit is None:
         words = "best effort"
     elif connection.discard_limit == 0:

@@ -261,7 +261,6 @@ def plugin_key(plugin: Any) -> str | None:
 
 
 def _all_of(given: Any, kind: type[_Part], name: str, shown: str) -> tuple[_Part, ...]:
-    """The parts of a project, all of this kind."""
     parts = tuple(given) if isinstance(given, Iterable) else (given,)
     for index, each in enumerate(parts):
         if not isinstance(each, kind):

@@ -55,7 +55,6 @@ class _Hook(NamedTuple):
 
     @property
     def needed(self) -> list[PluginPort]:
-        """The required inputs."""
         return [port for port in self.declared.inputs or () if not port.is_optional]
 
     @property
@@ -97,7 +96,6 @@ class Loops:
 
     @cached_property
     def found(self) -> tuple[Loop, ...]:
-        """All loops of the project."""
         return tuple(self._loop(ring) for ring in self._rings)
 
     def problems(self) -> Iterator[Problem]:

@@ -313,7 +313,6 @@ class Connection:
 
     @property
     def keys(self) -> dict[str, Any]:
-        """The keys in a project file."""
         values = {f.name: (getattr(self, f.name), f.default) for f in fields(self)}
         del values["index"], values["namespace"]
         keys = {key: value for key, (value, default) in values.items() if value != default}
@@ -416,7 +415,6 @@ class Project:
 
     @property
     def folder(self) -> Path:
-        """The folder of the project file."""
         return self.file.parent
 
     def node(self, name: str) -> Node:
@@ -443,7 +441,6 @@ def bytes_of(text: str) -> int:
 
 
 def resources_of(keys: Mapping[str, Any]) -> Resources:
-    """The limits in valid keys of a node."""
     given = keys.get("resources", {})
     memory, cpus, pids = (given.get(key) for key in ("memory", "cpus", "pids"))
     return Resources(
@@ -454,7 +451,6 @@ def resources_of(keys: Mapping[str, Any]) -> Resources:
 
 
 def access_of(keys: Mapping[str, Any]) -> Access:
-    """The access in valid keys of a node."""
     gpus = keys.get("gpus", ())
     return Access(
         devices=tuple(keys.get("devices", ())),
@@ -495,12 +491,10 @@ def parameters_of(written: Mapping[str, Any]) -> dict[str, Value]:
 
 
 def durations_of(written: Mapping[str, Any]) -> dict[str, Distribution]:
-    """By hook, its duration in virtual time, from valid values."""
     return {hook: Distribution.of(value) for hook, value in written.items()}
 
 
 def parameters_to_json(parameters: Mapping[str, Value]) -> dict[str, Any]:
-    """Parameters as JSON."""
     return {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in parameters.items()

@@ -57,15 +57,9 @@ class Names:
         return ["--ros-args", *rules] if rules else []
 
 
-def normalised_namespace(written: str) -> str:
-    """``/left`` for ``left`` and ``/left``; empty for ``/``, the global one."""
-    stripped = written.strip("/")
-    return f"/{stripped}" if stripped else ""
-
-
 def names_from(namespace: str, remap: Mapping[str, str]) -> Names:
     """The names of a project, from valid values of its keys."""
-    return Names(normalised_namespace(namespace), tuple(remap.items()))
+    return Names(f"/{namespace.strip('/')}".rstrip("/"), tuple(remap.items()))
 
 
 def names_to_json(names: Names) -> dict[str, Any]:

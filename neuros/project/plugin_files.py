@@ -75,7 +75,6 @@ class Remark:
     hint: str = ""
 
     def in_file(self, path: Path) -> Problem:
-        """The problem that messages show."""
         return Problem(display_name(path), self.line, self.column, "", self.text, self.hint)
 
 
@@ -169,7 +168,6 @@ def file_of(functions: Sequence[Callable[..., Any]]) -> Path:
 
 
 def read_functions(functions: Sequence[Callable[..., Any]]) -> list[PluginFile]:
-    """The declarations of functions of this program, one for each file that they are in."""
     found: dict[str, PluginFile] = {}
     for spec in hook_specs_of(dict(enumerate(functions))):
         file, _, line = spec.where.rpartition(":")

@@ -58,7 +58,6 @@ class Source:
         return line, position - self._line_starts[line - 1] + 1
 
     def problem(self, position: int, pointer: str, text: str, hint: str = "") -> Problem:
-        """A problem at a position; the whole document of a file is shown as ``/``."""
         line, column = self.place(position)
         return Problem(self.name, line, column, pointer or "/" * self.has_lines, text, hint)
 
@@ -88,7 +87,6 @@ class Element:
 
     @property
     def text(self) -> str:
-        """The JSON text of the value."""
         return self.source.text[self.start : self.end]
 
     @property
@@ -105,7 +103,6 @@ class Element:
         return self.value.get(key) if isinstance(self.value, dict) else None
 
     def string(self, key: str) -> str | None:
-        """The member of that key if it is a string."""
         member = self.member(key)
         return member.value if member is not None and isinstance(member.value, str) else None
 
@@ -134,11 +131,9 @@ class Element:
         return f"{self.source.name}:{f'{line}:{column}' if line else f' {self.pointer}'}"
 
     def problem(self, text: str, hint: str = "") -> Problem:
-        """A problem with the value."""
         return self.source.problem(self.start, self.pointer, text, hint)
 
     def key_problem(self, text: str, hint: str = "") -> Problem:
-        """A problem with the key."""
         return self.source.problem(self.key_start, self.pointer, text, hint)
 
 
@@ -317,7 +312,6 @@ def place_of(file: Path, pointer: str) -> tuple[int, int]:
 
 
 def problem_in(file: Path, pointer: str, text: str, hint: str = "") -> Problem:
-    """A problem at a pointer in a file."""
     return Problem(display_name(file), *place_of(file, pointer), pointer, text, hint)
 
 

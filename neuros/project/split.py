@@ -53,7 +53,6 @@ def split(project: Project, folders_for: Callable[[Node], Folders]) -> tuple[Nod
 
 
 def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
-    """The content of ``node.json``."""
     node = node_file.node
     return {
         "node": {**_node_keys(node), "environment": dict(node.environment)},
@@ -74,7 +73,6 @@ def node_file_to_json(node_file: NodeFile) -> dict[str, Any]:
 
 
 def node_file_text(node_file: NodeFile) -> str:
-    """The text of ``node.json``."""
     return json.dumps(node_file_to_json(node_file), indent=2) + "\n"
 
 
@@ -160,7 +158,6 @@ def project_to_json(project: Project) -> dict[str, Any]:
 
 
 def budgets_to_json(budgets: Budgets) -> dict[str, Any]:
-    """Budgets as JSON."""
     values = {**vars(budgets), "lost_packets": dict(budgets.lost_packets)}
     return {key: value for key, value in values.items() if value not in (None, {})}
 

@@ -80,7 +80,6 @@ class Distribution:
 
     @property
     def keys(self) -> Any:
-        """The inverse of :meth:`of`."""
         return self.values[0] if self.kind == "constant" else {self.kind: list(self.values)}
 
     @property

@@ -57,7 +57,6 @@ def provenance(command: Sequence[str], nodes: Iterable[Node], run_folder: Path) 
 
 
 def python_versions() -> dict[str, Any]:
-    """Versions of this Python and of its packages."""
     return {
         "python": platform.python_version(),
         "executable": sys.executable,

@@ -90,7 +90,6 @@ class SpoolWriter:
         self._last_of_stream_ns: dict[int, int] = {}
 
     def stream(self, way: Way, name: str) -> int | None:
-        """The number of a stream; ``None`` if its packets are not kept."""
         return self._numbers.get((way, name))
 
     def keep(
@@ -111,7 +110,14 @@ class SpoolWriter:
             why = f"a packet of {len(data)} bytes; {MOST_BYTES} are the most that can be recorded"
             raise OSError(errno.EFBIG, why)
         if self._descriptor < 0 or self._size >= self._file_bytes:
-            self._begin_file()
+            self.close()
+            flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_APPEND
+            folder = self._folder / _FOLDER
+            folder.mkdir(parents=True, exist_ok=True)
+            self._descriptor = os.open(_path(folder, self._files), flags, 0o644)
+            fcntl.flock(self._descriptor, fcntl.LOCK_SH)  # until it is closed
+            self._files += 1
+            self._size = 0
         header = _HEADER.pack(len(data), stream, wall_ns, sim_ns)
         if len(data) <= _SMALL_BYTES:
             written = os.write(self._descriptor, header + data)
@@ -122,24 +128,12 @@ class SpoolWriter:
         self._size += written
 
     def close(self) -> None:
-        """Close the file."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
 
-    def _begin_file(self) -> None:
-        self.close()
-        flags = os.O_CREAT | os.O_EXCL | os.O_WRONLY | os.O_APPEND
-        folder = self._folder / _FOLDER
-        folder.mkdir(parents=True, exist_ok=True)
-        self._descriptor = os.open(_path(folder, self._files), flags, 0o644)
-        fcntl.flock(self._descriptor, fcntl.LOCK_SH)  # until it is closed
-        self._files += 1
-        self._size = 0
-
 
 def open_recorder(plan: RecordingPlan, run: Path, node: str) -> SpoolWriter:
-    """The spool of a node, for writing."""
     return SpoolWriter(run / node, plan.streams.get(node, ()))
 
 
@@ -189,7 +183,6 @@ class SpoolReader:
 
     @property
     def has_files(self) -> bool:
-        """Whether the spool has files. Raises ``OSError``."""
         return bool(self._numbers())
 
     @property

@@ -226,7 +226,6 @@ class StoredBag:
 
 
 def bag_files(folder: Path) -> list[Path]:
-    """Files of bags in a folder."""
     found = (each for each in folder.iterdir() if each.name.endswith(_SUFFIXES))
     return sorted(found, key=lambda each: (len(each.name), each.name))  # bag_2 before bag_10
 

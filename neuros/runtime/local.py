@@ -110,7 +110,6 @@ class LocalLoop:
         return min(dues, default=None)
 
     def run_due_timers(self) -> None:
-        """Call the timers that are due."""
         now_ns = self.clock()
         for next_due_ns, on_due in self._timers:
             due_ns = next_due_ns()
@@ -190,7 +189,6 @@ class LocalLoop:
             self._events.popleft()()
 
     def stop(self) -> None:
-        """Handle no further event. Any thread."""
         self._is_stopping = True
         self.post_from_thread(_nothing)
         if self.ros is not None:
@@ -376,7 +374,6 @@ class LocalRosNode:
         return self.get_parameter(name)
 
     def set_parameters(self, parameters: Sequence[Any]) -> Sequence[Any]:
-        """Set parameters that are declared, as in rclpy."""
         if not self._real and all(each.name in self._parameters for each in parameters):
             self._parameters |= {each.name: each.value for each in parameters}
             return [SimpleNamespace(successful=True, reason="") for _ in parameters]
@@ -471,7 +468,6 @@ class LocalMiddleware:
         """Nothing: real time goes on, and is drawn from no seed."""
 
     def local_ros_node(self, file: NodeFile, logger: Logger) -> LocalRosNode:
-        """What a plugin gets as its ROS node."""
         node = file.node
         return LocalRosNode(node.name, logger, node.parameters, lambda _: self._ros_node(file))
 
@@ -514,14 +510,12 @@ class LocalMiddleware:
             self._local.take_in()
 
     def flush(self) -> None:
-        """Send and receive nothing any more, and let what was sent last leave."""
         for transport in self._transports:
             transport.close()
         if self._ros is not None:
             self._ros.flush()
 
     def close(self) -> None:
-        """Give up ROS, if it was used."""
         ros, self._ros = self._ros, None
         if ros is not None:
             ros.close(may_stay=bool(self._files))

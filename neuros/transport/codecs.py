@@ -78,12 +78,10 @@ class MessageCodec:
         self._kind = kind
 
     def encode(self, packet: Any) -> bytes:
-        """The serialised message."""
         data: bytes = serialize_message(packet)
         return data
 
     def decode(self, data: bytes) -> Any:
-        """The message."""
         try:
             return deserialize_message(data, self._kind)
         except Exception as error:  # rclpy does not say which
@@ -99,7 +97,6 @@ class CdrCodec(MessageCodec):
         self._read = _reader(kind, parts)
 
     def encode(self, packet: Any) -> bytes:
-        """The serialised message."""
         try:
             if type(packet) is not self._kind:
                 raise Unusual
@@ -112,7 +109,6 @@ class CdrCodec(MessageCodec):
             return super().encode(packet)
 
     def decode(self, data: bytes) -> Any:
-        """The message."""
         if data[:_START] != HEADER:
             return super().decode(data)
         try:
@@ -153,7 +149,6 @@ class ArrayCodec:
         self._end = len(self._prefix) + kind.nbytes
 
     def encode(self, packet: Any) -> bytes:
-        """The serialised message."""
         data: bytes = self._prefix + packet.tobytes()
         return data
 
@@ -195,7 +190,6 @@ class ArrayCodec:
 
 @cache
 def array_codec(kind: ArrayType) -> ArrayCodec:
-    """The codec for the arrays of a type."""
     return ArrayCodec(kind)
 
 
@@ -255,7 +249,15 @@ def _parts(entries: Iterable[Leaf | None]) -> Iterator[Part]:
 def _item(of: Type) -> tuple[WriteItem, ReadItem]:
     """Writer and reader of a value that is no number."""
     if of.sort is Sort.MESSAGE:
-        return _message(of.message)
+        parts = _parts_of(of.message)
+        writers = [part.write for part in parts]
+
+        def write(message: Any, pieces: Pieces, at: int) -> int:
+            for write_part in writers:
+                at = write_part(message, pieces, at)
+            return at
+
+        return (writers[0] if len(writers) == 1 else write), _reader(of.message, parts)
     if of.sort is Sort.TEXT:
         return write_text, read_text
     if of.sort is Sort.WIDE_TEXT:
@@ -263,18 +265,6 @@ def _item(of: Type) -> tuple[WriteItem, ReadItem]:
     if of.code:
         return _single(of.code)
     raise Unusual
-
-
-def _message(kind: Any) -> tuple[WriteItem, ReadItem]:
-    parts = _parts_of(kind)
-    writers = [part.write for part in parts]
-
-    def write(message: Any, pieces: Pieces, at: int) -> int:
-        for write_part in writers:
-            at = write_part(message, pieces, at)
-        return at
-
-    return (writers[0] if len(writers) == 1 else write), _reader(kind, parts)
 
 
 def _reader(kind: Any, parts: tuple[Part, ...]) -> ReadItem:

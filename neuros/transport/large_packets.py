@@ -101,10 +101,22 @@ class LargeOutput:
             self._has_room = False
             self._warn(f"large packets of {self._owner} go through DDS, which is slower: {error}")
             return self._plain.encode(packet)
-        return _parcel(self._buffers.encode_rest(packet), place)
+        message = self._buffers.encode_rest(packet)
+        name = place.segment.encode()
+        # RTPS pads to four bytes by itself, and the note must be found from the end.
+        padding = bytes(-(len(message) + len(name)) % 4)
+        lengths = struct.pack(f"<{len(place.lengths)}Q", *place.lengths)
+        note = _NOTE.pack(
+            place.generation,
+            place.slot_bytes,
+            place.slot,
+            len(message),
+            len(place.lengths),
+            len(name),
+        )
+        return b"".join((message[:2], PARCEL_MARK, message[4:], padding, lengths, name, note))
 
     def close(self) -> None:
-        """Remove the shared memory."""
         self._writer.close()
 
 
@@ -154,7 +166,6 @@ class LargeInput:
         return self._buffers.decode_with(message, buffers)
 
     def close(self) -> None:
-        """Give up the shared memory."""
         self._reader.close()
 
 
@@ -177,7 +188,6 @@ class LargeCodecs:
         self.inputs: dict[Connection, LargeInput] = {}
 
     def decoder(self, connection: Connection) -> Decoder:
-        """The decoder of a connection to this node."""
         kind = packet_kind(self._node.input(connection.destination_input).type)
         buffers = message_buffers(kind)
         if buffers is None:
@@ -264,22 +274,6 @@ def _is_large(buffers: Sequence[array[Any]]) -> bool:
     return size >= LARGE_BYTES
 
 
-def _parcel(message: bytes, place: BufferPlace) -> bytes:
-    name = place.segment.encode()
-    # RTPS pads to four bytes by itself, and the note must be found from the end.
-    padding = bytes(-(len(message) + len(name)) % 4)
-    lengths = struct.pack(f"<{len(place.lengths)}Q", *place.lengths)
-    note = _NOTE.pack(
-        place.generation,
-        place.slot_bytes,
-        place.slot,
-        len(message),
-        len(place.lengths),
-        len(name),
-    )
-    return b"".join((message[:2], PARCEL_MARK, message[4:], padding, lengths, name, note))
-
-
 def _contents(data: bytes) -> tuple[bytes, BufferPlace]:
     at = len(data) - _NOTE.size
     generation, slot_bytes, slot, length, count, name_length = _NOTE.unpack_from(data, at)
@@ -356,7 +350,6 @@ class MessageBuffers:
         return packet
 
     def put_back(self, packet: Any, buffers: Sequence[array[Any]]) -> None:
-        """Give a message these buffers."""
         for (*path, slot), buffer in zip(self._paths, buffers, strict=True):
             holder = packet
             for each in path:
@@ -380,7 +373,6 @@ class ArrayBuffers:
         return [packet.reshape(-1)]
 
     def views(self, packet: Any) -> Sequence[memoryview]:
-        """The bytes of the numbers."""
         return [memoryview(packet.reshape(-1)).cast("B")]
 
     def encode_rest(self, packet: Any) -> bytes:
@@ -476,7 +468,6 @@ class SegmentWriter:
         return BufferPlace(mapping.name, mapping.slot_bytes, slot, self._generation, lengths)
 
     def close(self) -> None:
-        """Remove all segments; who has mapped one keeps what it has."""
         mappings = [mapping for _, mapping in self._former]
         if self._current is not None:
             mappings.append(self._current)
@@ -540,7 +531,6 @@ class SegmentReader:
         return found
 
     def close(self) -> None:
-        """Give up the mapping."""
         self._mapping = None
 
 
@@ -555,7 +545,6 @@ class _Mapping:
         self._memory = memory
 
     def release(self) -> None:
-        """Unmap it."""
         self.generations.release()
         self.bytes.release()
         self._memory.close()

@@ -110,14 +110,12 @@ class LeanNode(RosNode):  # type: ignore[misc]
     def create_timer(
         self, timer_period_sec: float, callback: Any, *rest: Any, **keywords: Any
     ) -> Any:
-        """As in rclpy."""
         timer = super().create_timer(timer_period_sec, self._new(callback), *rest, **keywords)
         if self.callbacks is not None:
             self.callbacks.loop.add_ros_timer(timer)
         return timer
 
     def destroy_timer(self, timer: Any) -> bool:
-        """As in rclpy."""
         if self.callbacks is not None:
             self.callbacks.loop.remove_ros_timer(timer)
         is_destroyed: bool = super().destroy_timer(timer)
@@ -143,7 +141,6 @@ class LeanNode(RosNode):  # type: ignore[misc]
     def create_subscription(
         self, msg_type: Any, topic: str, callback: Any, qos_profile: Any, **keywords: Any
     ) -> Subscription:
-        """As in rclpy."""
         guarded = self._new(callback)
         if guarded is not callback and not inspect.iscoroutinefunction(callback):
             depth = qos_profile if isinstance(qos_profile, int) else qos_profile.depth
@@ -196,7 +193,6 @@ class _Tasks:
 
 
 def lean_node(file: NodeFile, context: Context) -> LeanNode:
-    """The ROS node of a node of a project."""
     return LeanNode(file.node.name, context, file.names, file.node.parameters)
 
 
@@ -307,7 +303,6 @@ class _EnteringSteps(Generator[Any, Any, Any]):
         return self
 
     def send(self, value: Any) -> Any:
-        """The next step."""
         self._enter()
         try:
             return self.cr_await.send(value)

@@ -111,7 +111,6 @@ class MemoryTransport:
                 self.digests[c] = digests
 
     def open(self, inbox: Inbox) -> None:
-        """Join the others."""
         self._end.is_open = True
         self._bridge.open(inbox)
         self._hub.join(self._name, inbox, self._connections)
@@ -167,7 +166,6 @@ class MemoryTransport:
         self._bridge.send_external(port, packet)
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
-        """Return what tells the sender which position every hook has reached."""
         return self._hub.link(connection).acknowledge
 
     def note_execution(self) -> None:
@@ -204,7 +202,6 @@ class MemoryTransport:
         ]
 
     def close(self) -> None:
-        """Send and receive nothing any more."""
         self._hub.leave(self._name)
         self._bridge.close()
 

@@ -75,7 +75,12 @@ def message_class(type_name: str) -> type:
         raise EnvironmentFault(f"{type_name!r} is not a message type: write package/msg/Name")
     package, name = named.groups()
     try:
-        _require_messages(package)
+        # Raise ``ImportError`` for what is no message package, without importing it. Bags, and
+        # other programs in the ROS domain, name types, too.
+        spec = importlib.util.find_spec(package)
+        folders = (spec and spec.submodule_search_locations) or ()
+        if not any(Path(folder, "msg").is_dir() for folder in folders):
+            raise ImportError(f"no message package named '{package}'")
         with imports_when_used():
             found = getattr(importlib.import_module(f"{package}.msg"), name)
         with warnings.catch_warnings():
@@ -89,17 +94,6 @@ def message_class(type_name: str) -> type:
             " installed in this node's container?"
         ) from error
     return cast(type, found)
-
-
-def _require_messages(package: str) -> None:
-    """Raise ``ImportError`` for what is no message package, without importing it.
-
-    Bags, and other programs in the ROS domain, name types, too.
-    """
-    spec = importlib.util.find_spec(package)
-    folders = (spec and spec.submodule_search_locations) or ()
-    if not any(Path(folder, "msg").is_dir() for folder in folders):
-        raise ImportError(f"no message package named '{package}'")
 
 
 def checked(port: Port, packet: Any) -> Any:
@@ -142,7 +136,6 @@ def copier_of(type_name: str) -> Copy:
 
 
 def encode_packet(packet: Any) -> bytes:
-    """A packet in the serialisation of ROS."""
     return message_codec(kind_of(packet)).encode(packet)
 
 

@@ -216,7 +216,6 @@ class RosTransport:
             self._external.send(port, packet)
 
     def acknowledger(self, connection: Connection) -> Callable[[int], None]:
-        """Return what publishes the position that every hook has reached."""
         return self._receiving[connection].acknowledge
 
     @property

@@ -142,7 +142,6 @@ class RosGraphBridge:
         self.heard: frozenset[Connection] = frozenset()
 
     def open(self, inbox: Inbox) -> None:
-        """Create the endpoints."""
         self._external.open(inbox)
         for connection in self._file.connections:
             if connection.source_node == self._file.node.name:
@@ -245,7 +244,17 @@ class QosCheck:
             nonlocal polls
             polls += 1
             is_last = polls == _MOST_QOS_POLLS
-            self._check_graph(is_last=is_last)
+            topic = self._port.external_topic  # by the name that rules apply to
+            if self._is_input:
+                others = self._ros_node.get_publishers_info_by_topic(topic)
+            else:
+                others = self._ros_node.get_subscriptions_info_by_topic(topic)
+            for other in others:
+                ends = (other.qos_profile, self._own)
+                lacking = list(qos_differences(*(ends if self._is_input else ends[::-1])))
+                # The name of its node may come later than what it offers.
+                if lacking and (is_last or other.node_name != _UNKNOWN_NODE):
+                    self._warn(other, lacking)
             if len(self._named) >= total or is_last:
                 self._ros_node.destroy_timer(timer)
                 if not self._named:
@@ -255,19 +264,6 @@ class QosCheck:
                     )
 
         timer = self._loop.every(self._ros_node, _QOS_POLL_S, poll)
-
-    def _check_graph(self, *, is_last: bool) -> None:
-        topic = self._port.external_topic  # by the name that rules apply to
-        if self._is_input:
-            others = self._ros_node.get_publishers_info_by_topic(topic)
-        else:
-            others = self._ros_node.get_subscriptions_info_by_topic(topic)
-        for other in others:
-            ends = (other.qos_profile, self._own)
-            lacking = list(qos_differences(*(ends if self._is_input else ends[::-1])))
-            # The name of its node may come later than what it offers.
-            if lacking and (is_last or other.node_name != _UNKNOWN_NODE):
-                self._warn(other, lacking)
 
     def _warn(self, other: TopicEndpointInfo, lacking: list[tuple[str, str]]) -> None:
         gid = bytes(other.endpoint_gid)

@@ -141,7 +141,14 @@ class RosLoop:
         Callbacks that are taken in then put that off no further, however many keep coming.
         """
         if self._ros_timers:
-            self._call_due_ros_timers()
+            # Queue callbacks of timers that are due, before the turn in which the next hook starts.
+            for timer in [*self._ros_timers]:
+                try:
+                    if timer.is_ready():
+                        timer.handle.call_timer()
+                        self._executor.create_task(_call_back, timer)
+                except InvalidHandle:  # the plugin has destroyed it
+                    self._ros_timers.remove(timer)
         if not (self._has_arrivals and self.has_taken_in):
             return
         self.has_taken_in = False
@@ -165,16 +172,6 @@ class RosLoop:
         if timer in self._ros_timers:
             self._ros_timers.remove(timer)
 
-    def _call_due_ros_timers(self) -> None:
-        """Queue callbacks of timers that are due, before the turn in which the next hook starts."""
-        for timer in [*self._ros_timers]:
-            try:
-                if timer.is_ready():
-                    timer.handle.call_timer()
-                    self._executor.create_task(_call_back, timer)
-            except InvalidHandle:  # the plugin has destroyed it
-                self._ros_timers.remove(timer)
-
     @property
     def has_waiting_events(self) -> bool:
         return bool(self._events)
@@ -185,7 +182,6 @@ class RosLoop:
             self._post_turn()
 
     def post_loop_back(self, event: Event) -> None:
-        """Handle ``event`` after all that already wait, those of ROS included."""
         self._events.append((event, True))
         if not self._has_posted_turn:
             self._post_turn()
@@ -237,7 +233,14 @@ class RosLoop:
                 self._has_older_events = True
                 self.post(self._end_older_events)
             self._executor.spin_until_future_complete(self._waker, wait_s)
-            self._run_due_timers()
+            now_ns = time.monotonic_ns()
+            for next_due_ns, on_due in self._timers:
+                due_ns = next_due_ns()
+                if due_ns is not None and due_ns <= now_ns:
+                    try:
+                        on_due()
+                    except BaseException as error:
+                        self._on_failure(error)
 
     def run_until_idle(self) -> None:
         """Serve what ROS has waiting, and the events that follow from it."""
@@ -269,7 +272,6 @@ class RosLoop:
         self._executor.spin_until_future_complete(self._waker, _TAKE_IN_S)
 
     def stop(self) -> None:
-        """End :meth:`run` after the current event. Any thread."""
         self._is_stopping = True
         self._waker.wake(None)
         # The executor gets hold of the waker only when it spins for the first time; a stop a moment
@@ -305,7 +307,10 @@ class RosLoop:
         events = self._events
         begin_ns = since_ns = now_ns = time.monotonic_ns()
         if begin_ns - self._checked_ns > _CHECK_NS:
-            self._let_other_threads_run(begin_ns)
+            busy_ns = time.thread_time_ns()
+            if busy_ns - self._busy_ns > _MOST_BUSY * (begin_ns - self._checked_ns):
+                time.sleep(_GAP_S)
+            self._checked_ns, self._busy_ns = begin_ns, busy_ns
         length_ns = _TURN_NS
         is_first = True
         while events and not self._is_stopping:
@@ -336,12 +341,6 @@ class RosLoop:
         if self._timers:
             self._check_timers()
 
-    def _let_other_threads_run(self, now_ns: int) -> None:
-        busy_ns = time.thread_time_ns()
-        if busy_ns - self._busy_ns > _MOST_BUSY * (now_ns - self._checked_ns):
-            time.sleep(_GAP_S)
-        self._checked_ns, self._busy_ns = now_ns, busy_ns
-
     def _check_timers(self) -> None:
         """Leave the executor if a timer is due, or due at another time than was planned for."""
         if self._has_older_events:
@@ -354,16 +353,6 @@ class RosLoop:
     def _next_due_ns(self) -> int | None:
         dues = [due for next_due_ns, _ in self._timers if (due := next_due_ns()) is not None]
         return min(dues, default=None)
-
-    def _run_due_timers(self) -> None:
-        now_ns = time.monotonic_ns()
-        for next_due_ns, on_due in self._timers:
-            due_ns = next_due_ns()
-            if due_ns is not None and due_ns <= now_ns:
-                try:
-                    on_due()
-                except BaseException as error:
-                    self._on_failure(error)
 
 
 def _call_back(timer: Timer) -> None:
@@ -441,11 +430,9 @@ class WaitSetExecutor:
         self._has_no_other_work = lambda: False
 
     def add_node(self, node: RosNode) -> None:
-        """Serve what is on a ROS node."""
         self._ros.add_node(node)
 
     def create_task(self, callback: Callable[..., None], *arguments: Any) -> None:
-        """Call back after what waits already. Any thread."""
         self._tasks.append(partial(callback, *arguments))
         self._ros.wake()
 
@@ -468,7 +455,6 @@ class WaitSetExecutor:
             future.remove_done_callback(self._wake)
 
     def shutdown(self, timeout_sec: float) -> None:
-        """Give up the wait set."""
         self._ros.shutdown(timeout_sec)
 
     def _wake(self, _: Any) -> None:

@@ -88,7 +88,6 @@ class Listener:
         self._loop: RosLoop | None = None
 
     def run(self) -> None:
-        """Listen."""
         context = _context()
         node = LeanNode("neuros_recorder", context)
         loop = RosLoop(context, self._fail)

@@ -91,7 +91,6 @@ class Field:
 
     @property
     def is_message(self) -> bool:
-        """Whether it holds one message."""
         return self.shape is Shape.SINGLE and self.type.sort is Sort.MESSAGE
 
     @property
@@ -204,7 +203,6 @@ class Schema:
 
 @cache
 def schema(kind: Any) -> Schema:
-    """The schema of a message class."""
     return Schema(kind)
 
 

@@ -19,8 +19,9 @@ from neuros.backends.pythons import (
     find_python,
     require_one_python,
     wanted_version,
+    why_no_files,
+    why_uv_failed,
 )
-from neuros.backends.virtual_environments import why_no_files, why_uv_failed
 from neuros.errors import EnvironmentFault
 from neuros.project.model import Node
 

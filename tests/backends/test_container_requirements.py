@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from neuros.backends.virtual_environments import read_requirements, unmet
+from neuros.backends.pythons import read_requirements, unmet
 from neuros.errors import EnvironmentFault
 
 JSONSCHEMA = version("jsonschema")

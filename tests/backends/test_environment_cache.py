@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from neuros.backends.virtual_environments import CachedEnvironment, cache_folder
+from neuros.backends.pythons import CachedEnvironment, cache_folder
 from neuros.caching import sweep
 
 MONTHS_AGO_S = time.time() - 90 * 24 * 3600

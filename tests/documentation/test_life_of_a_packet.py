@@ -16,7 +16,7 @@ from sensor_msgs.msg import Imu
 from neuros.node.context import ContextSwitch
 from neuros.node.node import NodeRuntime
 from neuros.project.model import Folders, Node, NodeFile, Port
-from neuros.testing.stand_ins import ManualClock, StepLoop, Topics, Workbench, numbered, wire
+from neuros.testing.harness import ManualClock, StepLoop, Topics, Workbench, numbered, wire
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "life_of_a_packet.md").read_text("utf-8")

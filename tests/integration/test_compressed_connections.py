@@ -18,7 +18,7 @@ from machines import require_machines
 from transport_checks import SERIES, TransportBench
 
 from neuros.project.model import Connection, NodeFile
-from neuros.testing.stand_ins import wire
+from neuros.testing.harness import wire
 from neuros.transport.large_packets import LargeCodecs
 from neuros.transport.messages import make_packet
 

@@ -17,7 +17,7 @@ from transport_checks import SERIES, TransportBench
 
 from neuros.backends.domain import choose_domain
 from neuros.project.model import NodeFile
-from neuros.testing.stand_ins import wire
+from neuros.testing.harness import wire
 from neuros.transport import large_packets
 from neuros.transport.messages import make_packet
 

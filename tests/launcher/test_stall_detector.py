@@ -14,8 +14,7 @@ from msgspec import structs
 
 from neuros.control import Report
 from neuros.launcher.nodes import NodeView
-from neuros.launcher.stall_detector import Backlog, StallDetector
-from neuros.launcher.thread_reader import ThreadReader
+from neuros.launcher.stall_detector import Backlog, StallDetector, ThreadReader
 from neuros.ports import RunningNode
 from neuros.project.model import Connection
 from neuros.stacks import ProcessThreads, Stack, Thread

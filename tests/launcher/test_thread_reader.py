@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import cast
 
-from neuros.launcher.thread_reader import ThreadReader
+from neuros.launcher.stall_detector import ThreadReader
 from neuros.ports import RunningNode
 from neuros.stacks import ProcessThreads
 

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from neuros.ports import Transport
 from neuros.project.model import Connection, Folders, Node, NodeFile, Port
-from neuros.testing.stand_ins import numbered, wire
+from neuros.testing.harness import numbered, wire
 from neuros.transport.messages import make_packet
 
 NUMBER, SERIES = "std_msgs/msg/Int32", "std_msgs/msg/Float64MultiArray"

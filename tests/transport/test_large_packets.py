@@ -12,7 +12,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Image
 
 from neuros.errors import ProtocolError
-from neuros.testing.stand_ins import wire
+from neuros.testing.harness import wire
 from neuros.transport.large_packets import (
     LARGE_BYTES,
     LargeInput,

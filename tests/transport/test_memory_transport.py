@@ -9,7 +9,7 @@ from transport_checks import TransportBench, TransportChecks
 
 from neuros.ports import Transport
 from neuros.project.model import NodeFile
-from neuros.testing.stand_ins import ManualClock, StepLoop, Topics, Workbench, wire
+from neuros.testing.harness import ManualClock, StepLoop, Topics, Workbench, wire
 
 
 class MemoryNetwork:

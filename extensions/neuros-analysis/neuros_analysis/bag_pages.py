@@ -72,7 +72,6 @@ def times_of(bag: Bag) -> list[TopicTimes]:
 
 
 def bag_page(bag: Bag, topics: list[TopicTimes]) -> str:
-    """The page of a bag."""
     told = [f"{bag.duration_s:.2f} s", f"{sum(len(t.times_s) for t in topics)} packets"]
     told += [f"ROS {bag.distribution.capitalize()}"] if bag.distribution else []
     parts = [f"<p>{escape('; '.join(told))}.</p>"]
@@ -89,7 +88,6 @@ def bag_page(bag: Bag, topics: list[TopicTimes]) -> str:
 
 
 def times_figure(topics: list[TopicTimes]) -> Any:
-    """A row of marks for each topic."""
     figure = new_figure(1.2 + _ROW_IN * len(topics))
     axes = plain(figure.add_subplot())
     marks = [t.times_s[:: -(-len(t.times_s) // _MOST_MARKS)] for t in topics]

@@ -53,7 +53,6 @@ def plain(axes: Any) -> Any:
 
 
 def add_legend(figure: Any, columns: int, **options: Any) -> None:
-    """A legend below all axes."""
     figure.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=8, **options)
 
 

@@ -32,7 +32,6 @@ exit codes:
 
 
 def add_report(report: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     report.description = (
         "Say what limited the speed of a run, and write a page (HTML, one file) with figures, and"
         " the figures themselves (PNG)."
@@ -49,7 +48,6 @@ def add_report(report: argparse.ArgumentParser) -> None:
 
 
 def add_compare(compare: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     compare.description = (
         "Print the numbers of several runs side by side. A folder that is no run folder is named"
         " and left out (exit code 2)."
@@ -197,7 +195,6 @@ def writing(folder: Path) -> Iterator[None]:
 
 
 def add_sweep(command: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     command.description = (
         "Run a project with every combination of values and seeds, and write one"
         " table (sweep.csv). Runs that have already finished in the same folder are not repeated."

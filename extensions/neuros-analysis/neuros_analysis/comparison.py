@@ -47,7 +47,6 @@ def figures_of(runs: Sequence[ReviewedRun]) -> dict[str, list[float | None]]:
 
 
 def comparison_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """The rows as text."""
     align = ("left", *("right" for _ in header[1:])) if rows else None
     return str(tabulate(rows, headers=header, disable_numparse=True, colalign=align))
 

@@ -125,7 +125,6 @@ class _Search:
         return self.budgets[node].own_s
 
     def _follow(self, node: str) -> tuple[list[Step], tuple[str, ...]]:
-        """The steps, and the loop in which they end."""
         steps: list[Step] = []
         seen: list[str] = []
         while True:
@@ -236,7 +235,6 @@ class Findings:
 
 
 def findings_of(run: ReviewedRun) -> Findings:
-    """The findings on a run, in sentences."""
     budgets = run.time_budgets
     if not budgets or not run.running_s:
         return Findings("The bottleneck is not known: no node has reported how it spent its time.")

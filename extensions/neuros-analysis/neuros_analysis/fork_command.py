@@ -15,7 +15,6 @@ EXIT_DIFFERENT = 6
 
 
 def add_fork(fork: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     fork.description = (
         "Execute a run that has ended again up to a simulated time, then go on with other settings"
         " to its end: a run of its own. Without settings, `neuros verify` finds both identical."

@@ -206,7 +206,6 @@ class _Picture:
         self._top, self._bottom = min(rows), max(rows)
 
     def lines(self) -> Iterator[str]:
-        """The file, line by line."""
         width = self._left[-1] - _GAP + _MARGIN
         height = (self._bottom - self._top) * _ROW + _HEIGHT + 2 * _MARGIN
         title = escape(self._project.name)
@@ -259,7 +258,6 @@ class _Picture:
         yield f'<text x="{x:.1f}" y="{y + 15:.1f}" {style} font-size="12">{small}</text>'
 
     def _route(self, connection: Connection, route: Sequence[Place]) -> str:
-        """The line of a connection."""
         parts = []
         for a, b in itertools.pairwise(route):
             (x, y), (to_x, to_y) = self._at(a), self._at(b)
@@ -282,7 +280,6 @@ class _Picture:
 
 
 def _marker(colour: str) -> str:
-    """The head of an arrow."""
     return (
         f'<marker id="{_marker_name(colour)}" viewBox="0 0 10 10" refX="9" refY="5"'
         ' markerWidth="12" markerHeight="12" markerUnits="userSpaceOnUse" orient="auto">'

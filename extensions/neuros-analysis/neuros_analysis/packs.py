@@ -15,7 +15,6 @@ https://w3id.org/ro/wfrun/process/0.5)::
 from __future__ import annotations
 
 import argparse
-import hashlib
 import importlib.metadata
 import json
 import os
@@ -32,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuros.distribution import libraries, python_command
 from neuros.errors import EnvironmentFault, ProjectError, UsageError
+from neuros.ordinary_files import digest_of
 
 if TYPE_CHECKING:
     from neuros.project.model import Project
@@ -115,7 +115,7 @@ def _locked(record: Mapping[str, Any], project: Project) -> list[tuple[str, str]
     from packaging.requirements import InvalidRequirement, Requirement
 
     from neuros.backends.containers import find_container
-    from neuros.backends.virtual_environments import read_requirements
+    from neuros.backends.pythons import read_requirements
 
     versions = record["versions"]
     had = {_plain(name): version for name, version in versions["packages"].items()}
@@ -231,20 +231,12 @@ def _metadata(draft: Path, record: Mapping[str, Any]) -> dict[str, Any]:
                     "@type": "File",
                     "name": Path(name).name,
                     "contentSize": str(path.stat().st_size),
-                    "sha256": _digest(path),
+                    "sha256": digest_of(path),
                 }
                 for name, path in zip(names, files, strict=True)
             ),
         ],
     }
-
-
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        whole = hashlib.sha256()
-        while data := file.read(1 << 20):
-            whole.update(data)
-    return whole.hexdigest()
 
 
 def run_again(file: Path, folder: Path) -> tuple[Path, Path]:
@@ -280,7 +272,7 @@ def _unpack(file: Path, folder: Path) -> None:
             archive.extractall(folder)
         graph = json.loads((folder / METADATA).read_text("utf-8"))["@graph"]
         known = {each["@id"]: each["sha256"] for each in graph if "sha256" in each}
-        changed = [name for name in known if _digest(folder / name) != known[name]]
+        changed = [name for name in known if digest_of(folder / name) != known[name]]
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise UsageError(
             f"{file}: is not what `neuros pack` writes: {type(error).__name__}: {error}"
@@ -293,7 +285,7 @@ def _unpack(file: Path, folder: Path) -> None:
 def _environment(folder: Path, version: str) -> Path:
     """Make the environment of the pack; returns its Python. Raises ``EnvironmentFault``."""
     from neuros.backends.pythons import find_python
-    from neuros.installation.packages import InstallationFailed, Installer, make_venv
+    from neuros.installation.packages import InstallationFailed, Installer
     from neuros.installation.progress import Progress
 
     major, minor, *_ = version.split(".")
@@ -302,11 +294,10 @@ def _environment(folder: Path, version: str) -> Path:
         raise EnvironmentFault(f"the run had Python {version}: install Python {major}.{minor} here")
     progress, place = Progress(sys.stderr), folder / "environment"
     progress.step(f"making an environment of Python {major}.{minor} with the packages of the run")
-    if why := make_venv(python_command("venv", str(place), python=base), os.environ):
-        raise EnvironmentFault(why)
     python, log = place / "bin" / "python", folder / "environment.log"
     installer = Installer(python, folder, log, progress, _surroundings(folder))
     try:
+        installer.make_environment(base)
         installer.install(["--no-deps", "--requirement", str(folder / _REQUIREMENTS)])
     except InstallationFailed as failure:
         rows = failure.output.strip().splitlines() or ["uv does not say why"]
@@ -347,7 +338,6 @@ def _main() -> None:
 
 
 def add_pack(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     parser.description = (
         "Write a run with its project, its packages and NeuROS into one file, an RO-Crate."
         " `neuros verify FILE` unpacks it, runs the project again and compares all packets."

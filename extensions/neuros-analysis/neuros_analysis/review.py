@@ -121,7 +121,6 @@ class ReviewedRun(PastRun):
 
     @property
     def name(self) -> str:
-        """Name for headings."""
         return f"{self.record.get('project', '?')} ({self.folder.name})"
 
     @property
@@ -137,7 +136,6 @@ class ReviewedRun(PastRun):
 
     @property
     def time_owner(self) -> str | None:
-        """The node that owns simulated time."""
         return next((n for n in self.nodes if self.nodes[n].get("sim_time") is not None), None)
 
     @cached_property

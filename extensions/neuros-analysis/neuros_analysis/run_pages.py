@@ -87,7 +87,6 @@ def report_page(
 
 
 def page(title: str, parts: Sequence[str]) -> str:
-    """A page of ready-made parts."""
     return _filled("report_page.html", title, body="\n".join(parts))
 
 
@@ -98,7 +97,6 @@ def _filled(template: str, title: str, **values: str) -> str:
 
 
 def bottleneck_part(findings: Findings, title: str = "The bottleneck") -> str:
-    """The findings under a heading."""
     lines = [f"<p>{escape(findings.headline)}</p>"]
     if findings.reasons:
         items = "".join(f"<li>{escape(reason)}</li>" for reason in findings.reasons)
@@ -299,7 +297,6 @@ def _in_script(content: Any) -> str:
 
 
 def _panels(name: str, topic: RecordedTopic, start_ns: int) -> Iterator[dict[str, Any]]:
-    """The panels of an output."""
     if not topic.count:
         return
     if topic.type == SPIKES:

@@ -31,6 +31,7 @@ from neuros.api.run import Run
 from neuros.caching import locked
 from neuros.errors import EnvironmentFault, NeurosError, Problem, ProjectError, UsageError
 from neuros.options import takes
+from neuros.ordinary_files import write_whole
 from neuros.ports import Job, JobResources, Jobs, SweepExecutor, SweepPlan
 from neuros.recording.run_file import RUN_FILE, read_object
 from neuros.registry import AUTO, BACK_ENDS, EXECUTORS
@@ -273,9 +274,7 @@ class _Sweeping:
             writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
             writer.writeheader()
             writer.writerows(self._sweep.rows)
-            new = self._sweep.folder / f"{CSV_NAME}.new"
-            new.write_text(text.getvalue(), "utf-8")
-            os.replace(new, self._sweep.folder / CSV_NAME)
+            write_whole(self._sweep.folder / CSV_NAME, text.getvalue().encode())
         except OSError as error:
             file = self._sweep.folder / CSV_NAME
             raise EnvironmentFault(f"{file} cannot be written ({error.strerror})") from error
@@ -353,7 +352,6 @@ def _locked_folder(folder: Path) -> Iterator[None]:
 
 
 def _columns_of(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The columns of all rows; the folder is the last."""
     found = dict.fromkeys(name for row in rows for name in row)
     found.pop("folder", None)
     return [*found, "folder"]

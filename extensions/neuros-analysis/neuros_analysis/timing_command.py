@@ -24,7 +24,6 @@ _Panels = dict[str, dict[str, "Numbers"]]
 
 
 def add_timing(timing: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     timing.description = (
         "Measure how long the hooks of a run took, and how long packets were under way on each"
         " connection. With -o, write a file for `neuros launch --timing`. With a second run,"
@@ -80,7 +79,13 @@ def _timing(options: argparse.Namespace) -> int:
         missing = [dict(timing.missing) for timing in timings]
         print_json({"runs": [str(folder) for folder in runs], "rows": rows, "missing": missing})
     else:
-        _print(rows)
+        from neuros_analysis.comparison import comparison_table
+
+        cells = [
+            [f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()]
+            for row in rows
+        ]
+        print(comparison_table(["", *[*rows[0]][1:]] if rows else [""], cells))
         for folder, timing in zip(runs, timings, strict=True):
             for name, why in timing.missing.items():
                 print(f"missing{f' in {folder}' if len(runs) > 1 else ''}: {name}: {why}")
@@ -147,13 +152,3 @@ def _figures(values_s: Numbers) -> dict[str, float]:
 
     median, most = np.percentile(values_s, (50, 99)) * 1e3
     return {"median / ms": float(median), "99 % / ms": float(most)}
-
-
-def _print(rows: _Rows) -> None:
-    from neuros_analysis.comparison import comparison_table
-
-    cells = [
-        [f"{value:.3f}" if isinstance(value, float) else str(value) for value in row.values()]
-        for row in rows
-    ]
-    print(comparison_table(["", *[*rows[0]][1:]] if rows else [""], cells))

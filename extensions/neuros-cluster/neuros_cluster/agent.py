@@ -23,6 +23,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import neuros_cluster.messages as messages
 from neuros.backends.control_sockets import SOCKET_NAME, UnixListener
 from neuros.backends.domain import DomainLock, FileLock, choose_domain
 from neuros.backends.guardian import Guardian
@@ -38,31 +39,6 @@ from neuros.project.split import node_file_text, node_files_from_json
 from neuros.stacks import ProcessThreads
 from neuros.transport.dds_profile import as_asked
 from neuros_cluster.files import RECEIVED, RUNS, Follower, TreeStore, tree_cache, write_chunk
-from neuros_cluster.messages import (
-    TO_AGENT,
-    Chunk,
-    Examine,
-    Examined,
-    Finish,
-    Finished,
-    KillNode,
-    Lacking,
-    NodeEnded,
-    Place,
-    Placed,
-    Prepare,
-    Prepared,
-    ReadThreads,
-    Ready,
-    Refused,
-    Remark,
-    Sent,
-    Start,
-    Started,
-    ThreadsRead,
-    Took,
-    Tree,
-)
 from neuros_cluster.pump import Pump
 
 if TYPE_CHECKING:
@@ -75,7 +51,6 @@ _KEPT_S = 7 * 24 * 3600.0
 
 
 def add_agent(agent: argparse.ArgumentParser) -> None:
-    """Add the options of the program, which ``launch`` starts on another machine."""
     agent.add_argument("--in-image", action="store_true")
     agent.set_defaults(command=lambda options: Agent(is_in_image=options.in_image).run())
 
@@ -95,11 +70,11 @@ class Agent:
         os.dup2(2, 1)  # output of libraries must not mix with messages to the launcher
         self._inbox: queue.SimpleQueue[Message | None] = queue.SimpleQueue()
         self._pump = Pump(
-            read_from, write_to, TO_AGENT, "the launcher", self._inbox.put, self._lose
+            read_from, write_to, messages.TO_AGENT, "the launcher", self._inbox.put, self._lose
         )
         self._cache = tree_cache(os.environ)
         self._store = TreeStore(self._cache)
-        self._trees: tuple[Tree, ...] = ()
+        self._trees: tuple[messages.Tree, ...] = ()
         self._run: Path | None = None
         self._pythons = Pythons({})
         self._guardian: Guardian | None = None
@@ -119,7 +94,9 @@ class Agent:
         self._pump.start()
         reached_at = (os.environ.get("SSH_CONNECTION", "").split() or [""] * 4)[2]
         python = platform.python_version()
-        self._pump.send(Ready(__version__, python, platform.machine(), platform.node(), reached_at))
+        self._pump.send(
+            messages.Ready(__version__, python, platform.machine(), platform.node(), reached_at)
+        )
         try:
             pause_s = _QUIET_S
             while not (self._is_lost or self._is_over):
@@ -162,43 +139,43 @@ class Agent:
     def _handle(self, message: Message) -> None:
         try:
             match message:
-                case Place():
+                case messages.Place():
                     self._pump.timeout_s = message.timeout_s
                     self._begin_to_place(message)
-                case Chunk():
+                case messages.Chunk():
                     write_chunk(self._run or self._store.received, message)
-                case Sent():
+                case messages.Sent():
                     self._place()
-                case Prepare(nodes):
+                case messages.Prepare(nodes):
                     self._prepare(nodes)
-                case Start():
+                case messages.Start():
                     self._start(message)
-                case KillNode(node):
+                case messages.KillNode(node):
                     if node in self._processes:
                         self._processes[node].kill()
-                case ReadThreads(node):
+                case messages.ReadThreads(node):
                     # In a thread of its own: reading may take seconds.
                     reading = threading.Thread(
                         target=self._read_threads, args=(node,), name="neuros-stacks", daemon=True
                     )
                     reading.start()
-                case Took(size):
+                case messages.Took(size):
                     self._in_flight_bytes -= size
-                case Examine():
+                case messages.Examine():
                     self._examine()
-                case Finish():
+                case messages.Finish():
                     self._finish()
         except (NeurosError, OSError) as error:
-            self._pump.send(Refused(str(error)))
+            self._pump.send(messages.Refused(str(error)))
 
     # ------------------------------------------------------------------ before the run
 
-    def _begin_to_place(self, message: Place) -> None:
+    def _begin_to_place(self, message: messages.Place) -> None:
         self._cache.mkdir(parents=True, exist_ok=True)
         self._store.clean_up()
         remove_old_runs(self._cache)
         self._trees = message.trees
-        self._pump.send(Lacking(tuple(map(self._store.lacking, self._trees))))
+        self._pump.send(messages.Lacking(tuple(map(self._store.lacking, self._trees))))
 
     def _place(self) -> None:
         project, workspace = map(self._store.place, self._trees)
@@ -206,7 +183,7 @@ class Agent:
         runs = self._cache / RUNS
         runs.mkdir(exist_ok=True)
         self._run = Path(tempfile.mkdtemp(dir=runs))
-        self._pump.send(Placed(str(project), str(workspace), str(self._run)))
+        self._pump.send(messages.Placed(str(project), str(workspace), str(self._run)))
 
     def _prepare(self, nodes: Iterable[Mapping[str, Any]]) -> None:
         from neuros.api.plan import make_environments
@@ -219,19 +196,19 @@ class Agent:
                 " install.py there"
             )
         if self._is_in_image:
-            self._pump.send(Prepared(()))
+            self._pump.send(messages.Prepared(()))
             return
         files = node_files_from_json(nodes)
         folders, described = files[0].folders, [file.node for file in files]
         workspaces = Workspaces(folders.project / "workspace", folders.workspace, os.environ)
-        messages = Messages.of_nodes(described, workspaces)
-        if problems := messages.problems():
+        needed = Messages.of_nodes(described, workspaces)
+        if problems := needed.problems():
             raise ProjectError(problems)
         self._pythons = Pythons.choose(described, folders.project, os.environ)
         for notice in self._pythons.notices:
-            self._pump.send(Remark("INFO", notice))
-        make_environments(self._pythons, messages, _Remarks(self._pump))
-        self._pump.send(Prepared(tuple(map(str, messages.paths))))
+            self._pump.send(messages.Remark("INFO", notice))
+        make_environments(self._pythons, needed, _Remarks(self._pump))
+        self._pump.send(messages.Prepared(tuple(map(str, needed.paths))))
 
     def _examine(self) -> None:
         from neuros.doctor.checks import findings, look_at_machine
@@ -239,12 +216,12 @@ class Agent:
         look = look_at_machine(os.environ) if self._is_in_image else None
         found = look or findings(os.environ, proves=False)
         self._pump.send(
-            Examined(tuple((f.state.value, f.subject, f.text, f.remedy) for f in found))
+            messages.Examined(tuple((f.state.value, f.subject, f.text, f.remedy) for f in found))
         )
 
     # ------------------------------------------------------------------ the run
 
-    def _start(self, order: Start) -> None:
+    def _start(self, order: messages.Start) -> None:
         assert self._run is not None
         files = node_files_from_json(order.nodes)
         names = [file.node.name for file in files]
@@ -294,12 +271,12 @@ class Agent:
             self._monitor.start()
         started = ProcessLauncher(program).start(files, {**order.environment, **own})
         self._processes = {process.names[0]: process for process in started}
-        self._pump.send(Started())
+        self._pump.send(messages.Started())
 
     def _read_threads(self, node: str) -> None:
         process = self._processes.get(node)
         threads = ProcessThreads() if process is None else process.threads()
-        self._pump.send(ThreadsRead(node, threads))
+        self._pump.send(messages.ThreadsRead(node, threads))
 
     def _send_news(self) -> bool:
         """Send grown files and ends of nodes; returns whether there is more to send."""
@@ -318,7 +295,7 @@ class Agent:
                         break
             if how is not None:
                 del self._processes[name]
-                self._pump.send_last(NodeEnded(name, how))
+                self._pump.send_last(messages.NodeEnded(name, how))
         return has_sent or self._is_full
 
     @property
@@ -326,7 +303,7 @@ class Agent:
         """Whether the launcher has yet to acknowledge the most bytes that are sent ahead."""
         return self._in_flight_bytes > _MOST_IN_FLIGHT_BYTES
 
-    def _send(self, chunk: Chunk) -> None:
+    def _send(self, chunk: messages.Chunk) -> None:
         self._in_flight_bytes += len(chunk.data) * 3 // 4
         self._pump.send(chunk)
 
@@ -338,11 +315,11 @@ class Agent:
             self._send(chunk)
             while self._is_full and not self._is_lost:
                 message = self._next(_QUIET_S)
-                if isinstance(message, Took):
+                if isinstance(message, messages.Took):
                     self._in_flight_bytes -= message.size
             if self._is_lost:  # the rest stays here
                 return
-        self._pump.send(Finished(load, (problem,) if problem else ()))
+        self._pump.send(messages.Finished(load, (problem,) if problem else ()))
         self._pump.end()
         self._pump.join()
         self._is_over = True
@@ -356,7 +333,7 @@ class _Remarks(io.TextIOBase):
 
     def write(self, text: str) -> int:
         for line in filter(str.strip, text.splitlines()):
-            self._pump.send(Remark("INFO", line))
+            self._pump.send(messages.Remark("INFO", line))
         return len(text)
 
 

@@ -105,7 +105,6 @@ def check_names(options: ExportOptions) -> None:
 
 
 def add_export(export: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     export.description = (
         "Write the files with which Docker Compose or Kubernetes start a project, without NeuROS on"
         " their machines; each node gets a container. Or write a batch script that launches the"

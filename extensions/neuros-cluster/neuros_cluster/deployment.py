@@ -177,7 +177,6 @@ class Machines(Deployment):
         return faults
 
     def node_there(self, file: NodeFile, side: Side) -> NodeFile:
-        """A node with the paths of its machine."""
         there = side.machine.folders
         built = {_package(python): python.parent for python in side.messages}
         pairs = [
@@ -244,7 +243,6 @@ class _Launcher:
     def start(
         self, nodes: Sequence[NodeFile], environment: Mapping[str, str]
     ) -> Sequence[RunningNode]:
-        """Start all nodes or none. Raises ``EnvironmentFault``."""
         places, sides = self._machines.places, self._machines.sides
         try:
             for side in sides:
@@ -259,7 +257,6 @@ class _Launcher:
         return [*started, *(NodeElsewhere(side, name) for side in sides for name in side.nodes)]
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
-        """One line per process."""
         places, hosts = self._machines.places, self._machines.file.hosts
         here = [file for file in nodes if file.node.name not in places]
         elsewhere = [file.node.name for file in nodes if file.node.name in places]
@@ -316,7 +313,6 @@ class NodeElsewhere:
         return (self.name,)
 
     def poll(self) -> str | None:
-        """``None`` while the node runs, then how it ended, in words."""
         return self.side.machine.end_of(self.name)
 
     @property
@@ -327,7 +323,6 @@ class NodeElsewhere:
         self.side.machine.kill(self.name)
 
     def threads(self) -> ProcessThreads:
-        """The positions of its threads in Python code."""
         return self.side.machine.threads_of(self.name)
 
 

@@ -177,7 +177,18 @@ class Export:
                 node needs.
         """
         form = FORMS[self.options.form]
-        self._check_engine(form)
+        if self.options.host_network and form.file == "kubernetes.yaml":
+            raise UsageError("--host-network: Kubernetes gives each pod an address of its own")
+        if form.file == "kubernetes.yaml":
+            self._check_names()
+        for node in self.project.nodes:
+            for what in form.lacks:
+                if getattr(node.access, what):
+                    raise UsageError(
+                        f"node '{node.name}' asks for {what}, and {self.options.form} has none for"
+                        " its containers: export for compose, or run that node with"
+                        " `neuros launch -n`"
+                    )
         found, problems = files_to_copy(self.project.folder, self.folder)
         if problems:
             raise _NotExported(problems)
@@ -196,20 +207,6 @@ class Export:
             text = yaml.dump_all(documents, Dumper=_Dumper, sort_keys=False, width=10_000)
             file.write_text(form.head + text, "utf-8")
         return file
-
-    def _check_engine(self, form: Form) -> None:
-        if self.options.host_network and form.file == "kubernetes.yaml":
-            raise UsageError("--host-network: Kubernetes gives each pod an address of its own")
-        if form.file == "kubernetes.yaml":
-            self._check_names()
-        for node in self.project.nodes:
-            for what in form.lacks:
-                if getattr(node.access, what):
-                    raise UsageError(
-                        f"node '{node.name}' asks for {what}, and {self.options.form} has none for"
-                        " its containers: export for compose, or run that node with"
-                        " `neuros launch -n`"
-                    )
 
     def _check_names(self) -> None:
         """Check DNS labels: RFC 1035 for a Service, RFC 1123 for the host of an indexed Job."""
@@ -270,18 +267,7 @@ def export(project: Project, messages: Sequence[Path], options: ExportOptions) -
     for each in options_of(ExportOptions):
         if each.name in without and getattr(options, each.name) != each.default:
             raise UsageError(f"{each.flags[-1]} is not for {options.form}")
-    _check_options(project, options)
-    if options.form != "slurm":
-        return Export(project, messages, options).write()
-    script = _slurm_script_of(project, options)
-    folder = Path(options.output or f"{slug(project.name)}-slurm").absolute()
-    with _new(folder):
-        (folder / "job.sh").write_text(script, "utf-8")
-    return folder / "job.sh"
-
-
-def _check_options(project: Project, options: ExportOptions) -> None:
-    """Check options that the launchers of nodes, or their engine, would refuse later."""
+    # Check options that the launchers of nodes, or their engine, would refuse later.
     if problems := time_problems(project, project.nodes, parse_duration(options.duration)):
         raise _NotExported(problems)
     if options.domain_id is not None:
@@ -289,6 +275,13 @@ def _check_options(project: Project, options: ExportOptions) -> None:
     if options.peers is not None:
         named_peers(options.peers)
     check_names(options)
+    if options.form != "slurm":
+        return Export(project, messages, options).write()
+    script = _slurm_script_of(project, options)
+    folder = Path(options.output or f"{slug(project.name)}-slurm").absolute()
+    with _new(folder):
+        (folder / "job.sh").write_text(script, "utf-8")
+    return folder / "job.sh"
 
 
 @contextlib.contextmanager

@@ -30,6 +30,7 @@ from pathlib import Path
 
 from neuros.caching import KEY_LENGTH, UNUSED_S, Kept, cache_root, kept_in
 from neuros.errors import EnvironmentFault
+from neuros.ordinary_files import digest_of
 from neuros_cluster.messages import Chunk, Tree
 
 RECEIVED, RUNS = "received", "runs"
@@ -47,7 +48,6 @@ _EXECUTABLE = "+x"
 
 
 def tree_cache(environ: Mapping[str, str]) -> Path:
-    """The folder of all trees."""
     return cache_root(environ) / "machines"
 
 
@@ -60,7 +60,7 @@ def scan(name: str, folder: Path) -> Tree:
     try:
         paths = sorted(_files(folder)) if folder.is_dir() else []
         files = {
-            path.relative_to(folder).as_posix(): _digest_of(path)
+            path.relative_to(folder).as_posix(): digest_of(path)
             + (_EXECUTABLE if os.access(path, os.X_OK) else "")
             for path in paths
         }
@@ -143,18 +143,9 @@ def _find(tree: Tree, path: str, places: Sequence[Path]) -> Path | None:
     digest = tree.files[path].removesuffix(_EXECUTABLE)
     for file in (place / path for place in places):
         with contextlib.suppress(OSError):
-            if file.is_file() and _digest_of(file) == digest:
+            if file.is_file() and digest_of(file) == digest:
                 return file
     return None
-
-
-def _digest_of(path: Path) -> str:
-    """The SHA-256 of a file. Raises ``OSError``."""
-    digest = hashlib.sha256()
-    with open(path, "rb") as file:
-        while data := file.read(1 << 20):
-            digest.update(data)
-    return digest.hexdigest()
 
 
 def _files(folder: Path) -> Iterator[Path]:

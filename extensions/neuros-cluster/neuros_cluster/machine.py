@@ -156,7 +156,6 @@ class Machine:
         return tuple(map(Path, self._await(agent.Prepared).messages))
 
     def examine(self) -> Sequence[tuple[str, str, str, str]]:
-        """The findings of ``neuros doctor`` there. Raises ``EnvironmentFault``."""
         self._pump.send(agent.Examine())
         return self._await(agent.Examined).findings
 
@@ -194,7 +193,6 @@ class Machine:
         self._await(agent.Started)
 
     def kill(self, node: str) -> None:
-        """Kill the process of a node."""
         self._pump.send(agent.KillNode(node))
 
     def threads_of(self, node: str) -> ProcessThreads:
@@ -418,7 +416,6 @@ class ClockOffset:
 
     @property
     def is_known(self) -> bool:
-        """Whether an answer has arrived."""
         return self.round_trip_s < float("inf")
 
     def data_here(self, data: bytes) -> bytes:

@@ -118,7 +118,6 @@ def reach_peers(peers: str | None, timeout_s: float | None, signals: Sequence[in
 
 
 def add_part(part: argparse.ArgumentParser) -> None:
-    """Add the arguments of the program."""
     part.add_argument("file", type=Path)
     part.add_argument("node")
     add_options(part, _PART_OPTIONS)

@@ -140,7 +140,6 @@ class _SlurmJobs:
         self._wake.set()
 
     def close(self) -> None:
-        """End the thread."""
         self._is_closed = True
         self._wake.set()
         if self._watcher.ident is not None:
@@ -151,22 +150,19 @@ class _SlurmJobs:
         while self._open and not self._is_closed:
             self._wake.wait(_POLL_S)
             self._wake.clear()
-            self._read_results()
+            # Set the results of ended jobs; lists the folder once, whatever the number of jobs.
+            names = {file.name for file in Path(self._executor.folder).iterdir()}
+            for number, (job, future) in tuple(self._open.items()):
+                if job.paths.result_pickle.name not in names:
+                    continue
+                del self._open[number]
+                try:
+                    future.set_result(job.result())
+                except Exception as error:  # what the job raised, or the file is broken
+                    future.set_exception(error)
             if self._is_cancelled or time.monotonic() - asked_s >= _ASK_S:
                 self._fail_lost()
                 asked_s = time.monotonic()
-
-    def _read_results(self) -> None:
-        """Set the results of ended jobs; lists the folder once, whatever the number of jobs."""
-        names = {file.name for file in Path(self._executor.folder).iterdir()}
-        for number, (job, future) in tuple(self._open.items()):
-            if job.paths.result_pickle.name not in names:
-                continue
-            del self._open[number]
-            try:
-                future.set_result(job.result())
-            except Exception as error:  # what the job raised, or the file is broken
-                future.set_exception(error)
 
     def _fail_lost(self) -> None:
         """Fail jobs without a result that Slurm reports as ended, or not at all, twice in a row."""

@@ -255,7 +255,6 @@ class _World:
         return self._transforms(range(len(rows)), rows, at_ns)
 
     def transforms(self, poses: str, at_ns: int) -> messages.FrameTransforms:
-        """The frames of moving bodies."""
         rows = np.frombuffer(base64.b64decode(poses), "<f4").reshape(-1, _POSE)
         return self._transforms(self._geometry["moving"], rows.tolist(), at_ns)
 

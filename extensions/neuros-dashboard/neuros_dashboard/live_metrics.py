@@ -14,16 +14,7 @@ from collections.abc import Mapping, Sequence
 from statistics import fmean
 from typing import Any, TypeAlias
 
-from neuros.control import (
-    WORLD,
-    Ended,
-    GetStatus,
-    Message,
-    NodeStatus,
-    PhaseChanged,
-    Report,
-    Watch,
-)
+import neuros.control as control
 from neuros.control.link import ControlLink
 from neuros.engine.metrics import in_flight_and_lost, time_budget_of
 from neuros.errors import ControlError
@@ -204,8 +195,7 @@ class LiveMetrics:
         speed = self._speeds.get(("sim", ""))
         return None if speed is None else speed.per_s
 
-    def update(self, status: NodeStatus) -> None:
-        """Update the metrics from the status of a node."""
+    def update(self, status: control.NodeStatus) -> None:
         counters = status.counters
         if counters is None:
             self.nodes[status.node] = {"state": "loading", "cause": ""}
@@ -261,7 +251,7 @@ class LiveMetrics:
 
     def end(
         self,
-        reports: Mapping[str, Report],
+        reports: Mapping[str, control.Report],
         running_s: float | None,
         real_time_factor: float | None,
         has_drained: bool,
@@ -356,7 +346,7 @@ class ObservedRun:
     async def run(self) -> None:
         """Serve the pages until the run is over."""
         loop = asyncio.get_running_loop()
-        self.send(Watch())
+        self.send(control.Watch())
         loop.add_reader(self._link.fileno(), self._receive)
         asking = asyncio.create_task(self._ask())
         try:
@@ -366,7 +356,7 @@ class ObservedRun:
             loop.remove_reader(self._link.fileno())
             self._link.close()
 
-    def send(self, message: Message) -> None:
+    def send(self, message: control.Message) -> None:
         """Send to the supervisor, unless the run is over."""
         if not self._is_over.is_set():
             self._link.send(message)
@@ -391,8 +381,8 @@ class ObservedRun:
             asked_s = time.monotonic()
             wanted = self._pages.wanted()
             for node in self._geometries:
-                wanted.setdefault(node, {}).setdefault(WORLD, {})["geometry"] = True
-            self.send(GetStatus(wanted))
+                wanted.setdefault(node, {}).setdefault(control.WORLD, {})["geometry"] = True
+            self.send(control.GetStatus(wanted))
             # A node whose hook holds Python's global lock answers late: do not wait for it.
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._has_answered.wait(), _PATIENCE_S)
@@ -410,18 +400,20 @@ class ObservedRun:
         for message in messages or ():
             self._handle(message)
 
-    def _handle(self, message: Message) -> None:
+    def _handle(self, message: control.Message) -> None:
         match message:
-            case NodeStatus(node):
+            case control.NodeStatus(node):
                 self._metrics.update(message)
                 self._show_samples(node, message.samples)
                 self._answered.add(node)
                 if self._answered >= self._names:
                     self._has_answered.set()
-            case PhaseChanged():
+            case control.PhaseChanged():
                 self.phase = {"phase": message.phase, "is_paused": message.is_paused}
                 self._pages.send("phase", self.phase)
-            case Ended(exit_code, reason, reports, running_s, real_time_factor, has_drained):
+            case control.Ended(
+                exit_code, reason, reports, running_s, real_time_factor, has_drained
+            ):
                 self._metrics.end(reports, running_s, real_time_factor, has_drained)
                 self._show()
                 self.phase = {"phase": "ended", "is_paused": False}

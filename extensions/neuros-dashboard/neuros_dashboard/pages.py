@@ -44,11 +44,9 @@ class Page:
         self._events: asyncio.Queue[str | None] = asyncio.Queue(_MOST_WAITING)
 
     def send(self, event: str, data: Any) -> None:
-        """Queue an event; a page that does not read loses its oldest events."""
         self._put(f"event: {event}\ndata: {json.dumps(data)}\n\n")
 
     def end(self) -> None:
-        """End the stream of events."""
         self._put(None)
 
     async def next_event(self) -> str | None:
@@ -85,7 +83,6 @@ class Pages:
         return name, page
 
     def close(self, name: str) -> None:
-        """Remove a page."""
         self._pages.pop(name, None)
         if not self._pages:
             self.are_watched.clear()
@@ -100,12 +97,10 @@ class Pages:
         return True
 
     def send(self, event: str, data: Any) -> None:
-        """Send to all pages."""
         for page in self._pages.values():
             page.send(event, data)
 
     def end(self) -> None:
-        """End all pages' streams once their events have been read."""
         for page in self._pages.values():
             page.end()
 

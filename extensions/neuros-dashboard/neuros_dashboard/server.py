@@ -127,7 +127,6 @@ class Dashboard:
             await serving
 
     def app(self, token: str, run: str) -> Starlette:
-        """The ASGI application."""
         app = Starlette(
             routes=[
                 Route("/", self._index),

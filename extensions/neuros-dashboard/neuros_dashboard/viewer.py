@@ -98,12 +98,10 @@ class Views:
             log("INFO", view.start(run, guardian))
 
     def finish(self) -> None:
-        """Close what was opened."""
         for view in self._views.values():
             view.finish()
 
     def _show(self, flag: str, subject: str) -> None:
-        """Prepare the best viewer of a subject."""
         able = [each for each in map(VIEWERS.load, VIEWERS) if subject in each.ranks]
         reasons: list[str] = []
         for viewer in sorted(able, key=lambda each: -each.ranks[subject]):

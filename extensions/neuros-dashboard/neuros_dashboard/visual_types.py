@@ -111,7 +111,6 @@ class VisualTypes:
         return {"fields": [*self._pose_fields(), *self._numbers]}
 
     def marks(self, sample: Mapping[str, Any]) -> Iterator[Mark]:
-        """Marks of a sample."""
         if "image" in sample:
             yield Picture(sample["image"])
         if "all" in sample:

@@ -75,7 +75,6 @@ class ToolProcess:
         self._process = start_sidecar(program, command, log, run.environment, is_ours=False)
 
     def finish(self) -> None:
-        """End the process."""
         self._process.terminate()
         end_process(self._process, _END_S)
 
@@ -114,7 +113,6 @@ class ToolContainer:
         guardian.clean_with(leftovers.__name__, engine_socket(self._engine))
 
     def finish(self) -> None:
-        """End the container."""
         with contextlib.suppress(DockerException, requests.RequestException):
             self._container.stop(timeout=_STOP_S)  # fails if the user has closed the window
         self._engine.close()

@@ -246,7 +246,6 @@ class _Signal:
         return np.searchsorted(self.sent_ns, times_ns, side="right") - 1
 
     def first_after(self, times_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """The time of the first packet after each time."""
         sent_ns = np.append(self.sent_ns, _NEVER)
         return sent_ns[np.searchsorted(self.sent_ns, times_ns, side="right")]
 

@@ -69,8 +69,12 @@ class Numbers:
         self._resolve(port, f"{self.name}{brackets}", field, shape)
 
     def _resolve(self, port: Port, written: str, field: str, shape: Sizes | None) -> None:
-        """Find the numbers, their type and their shape."""
-        self._type, kind = port.type, _class_of(port.type)
+        package, _, name = port.type.partition("/msg/")
+        try:
+            kind: type = getattr(importlib.import_module(f"{package}.msg"), name)
+        except (ImportError, AttributeError) as error:
+            raise EnvironmentFault(f"message type {port.type} cannot be imported here") from error
+        self._type = port.type
         leaves = _leaves_of(kind, field)
         if not leaves:
             known = ", ".join(f"{self.port}.{_path(leaf)}" for leaf in _leaves_of(kind, ""))
@@ -96,7 +100,6 @@ class Numbers:
         self.dtype = np.dtype(np.uint8) if self.is_bool else np.result_type(*types)
 
     def read(self, message: Any) -> Any:
-        """The numbers of a message; raises ``UsageError`` if their number is another one."""
         values = self._get(message)
         if self._is_flat:
             return np.array(values, self.dtype).reshape(self.shape)
@@ -117,11 +120,9 @@ class Numbers:
         return factory_of(self._type)
 
     def message(self, values: Any) -> Any:
-        """A message with these numbers."""
         return self.put(values, self._make())
 
     def put(self, values: Any, message: Any) -> Any:
-        """Put the numbers into a message of the port; returns it, or an array in its place."""
         flat, start = np.asarray(values).reshape(-1), 0
         if flat.size != sum(self._sizes):
             raise UsageError(f"{self.name} takes {sum(self._sizes)} numbers, not {flat.size}")
@@ -154,11 +155,9 @@ class _ArrayNumbers(Numbers):
         self.dtype = np.dtype(np.uint8 if self.is_bool else array.dtype)
 
     def read(self, message: Any) -> Any:
-        """The numbers of an array."""
         return message.astype(self.dtype).reshape(self._all)
 
     def message(self, values: Any) -> Any:
-        """An array of these numbers; raises ``ValueError`` for one that does not fit."""
         given, is_float = np.asarray(values), self.dtype.kind == "f"
         if given.size != self._array.size:
             raise UsageError(f"{self.name} takes {self._array.size} numbers, not {given.size}")
@@ -175,7 +174,6 @@ class _ArrayNumbers(Numbers):
         return made
 
     def put(self, values: Any, message: Any) -> Any:
-        """An array of these numbers."""
         return self.message(values)
 
 
@@ -199,15 +197,6 @@ _CONVERT: Mapping[Sort, Callable[[Any], list[Any]]] = {
     Sort.FLOAT: lambda numbers: numbers.astype(float).tolist(),
 }
 """Converters from an array of numbers to values of a field."""
-
-
-def _class_of(type_name: str) -> type:
-    package, _, name = type_name.partition("/msg/")
-    try:
-        found: type = getattr(importlib.import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError) as error:
-        raise EnvironmentFault(f"message type {type_name} cannot be imported here") from error
-    return found
 
 
 def _leaves_of(kind: type, field: str) -> list[Leaf]:

@@ -103,11 +103,7 @@ def _set_inertia(body: Any, link: Element, inertial: Element | None) -> None:
         matrix = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
         matrix = pose.rotation @ _possible(matrix, mass, element) @ pose.rotation.T
     body.ipos = centre
-    _give(body, mass, matrix)
-
-
-def _give(body: Any, mass: float, matrix: Vector) -> None:
-    """Set mass and inertia; not as a full matrix, of which MuJoCo refuses moments below 1e-14."""
+    # Set mass and inertia; not as a full matrix, of which MuJoCo refuses moments below 1e-14.
     body.explicitinertial = True
     body.mass = mass
     moments, axes = np.linalg.eigh(matrix)

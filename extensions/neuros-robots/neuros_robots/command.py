@@ -23,7 +23,6 @@ exit codes:
 
 
 def add_convert(convert: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     convert.description = (
         "Turn a robot or a world in SDF (1.4 to 1.11), or a robot in URDF, into a MuJoCo model"
         " (MJCF), and list what MuJoCo has no counterpart for."

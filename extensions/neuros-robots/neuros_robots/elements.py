@@ -122,7 +122,6 @@ class Difference:
 
     @property
     def path(self) -> str:
-        """The path of the first one."""
         return self.paths[0]
 
     @property
@@ -156,7 +155,6 @@ class Report:
             raise DescriptionError([Problem(display_name(file), 1, 1, "/", text)])
 
     def omit_unread(self, roots: Iterable[Element]) -> None:
-        """Note the topmost elements that were not read."""
         for root in roots:
             for child in root.children:
                 if not child.is_read:
@@ -225,7 +223,6 @@ class Element:
 
     @property
     def path(self) -> str:
-        """Its path in the document, as ``model[arm]/link[base]/inertial``."""
         if self.source is not None:
             return self.source.path
         steps = [e.tag + (f"[{e.name}]" if e.name else "") for e in self.and_ancestors()][::-1]
@@ -280,14 +277,12 @@ class Element:
         return element
 
     def each(self, tag: str) -> list[Element]:
-        """All children with that tag."""
         found = [child for child in self.children if child.tag == tag]
         for child in found:
             child.is_read = True
         return found
 
     def mark_all_read(self) -> None:
-        """Mark this element and all within as read."""
         for element in self.descendants():
             element.is_read = True
 
@@ -354,7 +349,6 @@ class Element:
         return word in ("true", "1")
 
     def has(self, attribute: str) -> bool:
-        """Whether an attribute is true."""
         return self.attributes.get(attribute) in ("true", "1")
 
     def text_of(self, tag: str) -> str:
@@ -403,7 +397,6 @@ class _Builder:
 
     @property
     def line(self) -> int:
-        """The present line of the file."""
         return self.parser.CurrentLineNumber + self.skipped_lines
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:

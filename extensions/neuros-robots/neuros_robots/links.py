@@ -348,7 +348,6 @@ def _diffuse(material: Element) -> tuple[float, ...]:
 
 
 def add_link_sensors(building: Building, link: Link) -> None:
-    """Add the sensors of a link."""
     for element in link.element.each("sensor"):
         kind = element.type
         pose = link.scope.read_pose(element, link.pose)
@@ -373,7 +372,6 @@ def add_link_sensors(building: Building, link: Link) -> None:
 
 
 def add_joint_sensors(building: Building, link: Link, joint: Joint, *, is_turned: bool) -> None:
-    """Add the sensors of a joint to the body of its link."""
     for element in joint.element.each("sensor"):
         if element.type != "force_torque":
             element.omit("only a force_torque sensor belongs to a joint")
@@ -483,7 +481,6 @@ def _angles(settings: Element, way: str) -> tuple[int, list[float]]:
 
 
 def add_frames(building: Building, scope: Scope) -> None:
-    """Add a site for every ``<frame>``."""
     for inner, element in scope.each("frame"):
         if inner.is_world or element.name not in inner.frames or element.name[:1] == "_":
             continue

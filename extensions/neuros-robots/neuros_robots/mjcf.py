@@ -410,7 +410,6 @@ def _needs_conversion(file: Path) -> bool:
 
 
 def _fill(mesh: Any, triangles: Triangles) -> None:
-    """Give a mesh of a spec its triangles."""
     vertices, faces = triangles
     mesh.uservert, mesh.userface = vertices.ravel(), faces.ravel()
 

@@ -39,7 +39,15 @@ def convert_sdf(file: Path, finder: Finder) -> Converted:
     building = Building(spec, Meshes(spec, finder))
     branches, loops = _grow(scope)
     if scope.element.tag == "world":
-        _read_world(building, scope)
+        # Options of the whole model, from a ``<world>``, with SDF's defaults.
+        world, option = scope.element, building.spec.option
+        option.gravity = world.vector("gravity", _GRAVITY)
+        option.magnetic = world.vector("magnetic_field", _MAGNETIC_FIELD_T)
+        engines = world.each("physics")
+        for unused in engines[1:]:
+            unused.omit("only the first <physics> is used")
+        engine = engines[0] if engines else world.made("physics")
+        option.timestep = engine.number("max_step_size", 0.001, positive=True)
     bodies.add_tree(building, scope, branches)
     for joint in loops:
         bodies.close_loop(building, joint)
@@ -245,15 +253,3 @@ def _end(scope: Scope, joint: Element, side: str) -> Link | None:
         joint.problem(f"<{side}> is missing: which link is the {side}?")
         return None
     return scope.body(name, joint.child(side) or joint)
-
-
-def _read_world(building: Building, scope: Scope) -> None:
-    """Options of the whole model, from a ``<world>``, with SDF's defaults."""
-    world, option = scope.element, building.spec.option
-    option.gravity = world.vector("gravity", _GRAVITY)
-    option.magnetic = world.vector("magnetic_field", _MAGNETIC_FIELD_T)
-    engines = world.each("physics")
-    for unused in engines[1:]:
-        unused.omit("only the first <physics> is used")
-    engine = engines[0] if engines else world.made("physics")
-    option.timestep = engine.number("max_step_size", 0.001, positive=True)

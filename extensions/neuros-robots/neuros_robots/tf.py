@@ -76,7 +76,23 @@ class TransformBuffer:
             is_static: whether it is valid at any time, as those of ``/tf_static``.
         """
         for stamped in getattr(message, "transforms", (message,)):
-            self._add(stamped, is_static)
+            frame, parent = _plain(stamped.child_frame_id), _plain(stamped.header.frame_id)
+            moved, turned = _parts(stamped.transform)
+            pose = _Pose(to_nanoseconds(stamped), moved, turned)
+            if is_static or self._parents.get(frame) != parent:
+                self._poses[frame] = []
+            self._parents[frame] = parent
+            self._static.add(frame) if is_static else self._static.discard(frame)
+            poses = self._poses[frame]
+            if poses and pose < poses[-1]:
+                for other, later in self._poses.items():
+                    if other not in self._static:
+                        del later[bisect_right(later, pose) :]
+            if poses and poses[-1] == pose:  # of the same time
+                del poses[-1]
+            poses.append(pose)
+            while poses[-1].at_ns - poses[0].at_ns > self._cache_ns:
+                del poses[0]
 
     def lookup(self, target: str, source: str, at: Any = None) -> Any:
         """Look up ``source`` seen from ``target``: a ``geometry_msgs/msg/TransformStamped``.
@@ -106,25 +122,6 @@ class TransformBuffer:
         if down:
             pose = pose.within(self._chain(down, at_ns).inverted())
         return transform(target, source, at_ns, pose.translation, pose.rotation)
-
-    def _add(self, stamped: Any, is_static: bool) -> None:
-        frame, parent = _plain(stamped.child_frame_id), _plain(stamped.header.frame_id)
-        moved, turned = _parts(stamped.transform)
-        pose = _Pose(to_nanoseconds(stamped), moved, turned)
-        if is_static or self._parents.get(frame) != parent:
-            self._poses[frame] = []
-        self._parents[frame] = parent
-        self._static.add(frame) if is_static else self._static.discard(frame)
-        poses = self._poses[frame]
-        if poses and pose < poses[-1]:
-            for other, later in self._poses.items():
-                if other not in self._static:
-                    del later[bisect_right(later, pose) :]
-        if poses and poses[-1] == pose:  # of the same time
-            del poses[-1]
-        poses.append(pose)
-        while poses[-1].at_ns - poses[0].at_ns > self._cache_ns:
-            del poses[0]
 
     def _way(self, target: str, source: str) -> tuple[list[str], list[str]]:
         """The frames from the target, and from the source, up to their common ancestor."""

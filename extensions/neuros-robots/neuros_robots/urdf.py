@@ -291,7 +291,6 @@ class _Robot:
         )
 
     def _shape(self, source: Element, name: str) -> Element:
-        """A ``<visual>`` or ``<collision>``."""
         content = _pose(source)
         geometry = source.child("geometry")
         if geometry is not None:
@@ -408,7 +407,6 @@ def _named(root: Element, tag: str) -> dict[str, Element]:
 
 
 def _pose(owner: Element) -> list[Element]:
-    """The ``<origin>`` of an element as a ``<pose>``."""
     origin = owner.child("origin")
     if origin is None:
         return []

@@ -143,7 +143,6 @@ def built_image(recipe: Recipe, engine: DockerClient) -> Any | None:
 
 
 def is_current(image: Any, recipe: Recipe) -> bool:
-    """Whether the recipe is still that of the image."""
     return bool(image.labels.get(DIGEST) == recipe.digest)
 
 

@@ -191,7 +191,6 @@ class DockerLauncher:
         return started
 
     def describe(self, nodes: Sequence[NodeFile]) -> Sequence[str]:
-        """One line per container."""
         lines = []
         for file in nodes:
             node, image = file.node, self._containers.images[file.node.container]
@@ -236,7 +235,6 @@ class RunningContainer:
         events.add(container_id)
 
     def poll(self) -> str | None:
-        """``None`` while it runs, then how it ended, in words."""
         end = self._events.end_of(self.id)
         if end is not None:
             words = how_it_ended(*end, log_file(self._file), self._file.node.resources.mem_bytes)
@@ -362,7 +360,6 @@ class ContainerEvents(threading.Thread):
             self.signal_all(signal.SIGTERM)
 
     def close(self) -> None:
-        """End the connection."""
         self._is_closing = True
         with contextlib.suppress(OSError, DockerException):
             self._stream.close()
@@ -384,7 +381,6 @@ class ContainerEvents(threading.Thread):
         return fate.exit_code, fate.is_out_of_memory
 
     def fate(self, container_id: str) -> Fate:
-        """The events of a container so far."""
         return self._fates.setdefault(container_id, Fate())
 
     def pids(self, node: str | None = None) -> Sequence[int]:

@@ -217,7 +217,6 @@ def limits(node: Node) -> dict[str, Any]:
 
 
 def container_name(file: NodeFile, run_id: str) -> str:
-    """The unique name of a container."""
     return f"neuros-{file.node.name}-{run_id[:8]}"
 
 

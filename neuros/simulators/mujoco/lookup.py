@@ -104,7 +104,6 @@ def id_of(model: Any, sort: str, name: str) -> int:
 
 
 def has_any(model: Any, name: str) -> bool:
-    """Whether an element of any sort has this name."""
     return any(id_of(model, sort, name) >= 0 for sort in _SORTS)
 
 

@@ -203,7 +203,6 @@ class Data(Sensor):
         np.concatenate(self._parts, out=packet.reshape(-1), casting="same_kind")
 
     def _parts_of(self, data: Any) -> list[Any]:
-        """Views of the arrays."""
         return [part_of(data, name, self._time) for name in self.declared.elements]
 
 

@@ -249,7 +249,6 @@ class StepLock:
             return True
 
     def leave(self) -> None:
-        """End a bout of steps."""
         with self._changed:
             self._is_stepping = False
             self._changed.notify_all()

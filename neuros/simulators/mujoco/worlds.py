@@ -141,7 +141,11 @@ class MuJoCoWorlds:
         self._steps += count
         self._is_forward = False
         if np.concatenate(self._numbers).any():
-            self._report_warnings(count)
+            since = self._time.seconds(self._steps - count)
+            when = f"between {since:g} s and {self.sim_time:g} s of simulated time"
+            for index, data in enumerate(self.data):
+                where = f"{self._where}: copy {index}"
+                report_warnings(self._node, data, where, when, self._seen_warnings)
         if self._view.is_watched:
             self._view.record()
 
@@ -280,10 +284,3 @@ class MuJoCoWorlds:
             waiting.clear()  # after an error
             for future in futures:
                 future.cancel() or future.result()
-
-    def _report_warnings(self, count: int) -> None:
-        since = self._time.seconds(self._steps - count)
-        when = f"between {since:g} s and {self.sim_time:g} s of simulated time"
-        for index, data in enumerate(self.data):
-            where = f"{self._where}: copy {index}"
-            report_warnings(self._node, data, where, when, self._seen_warnings)

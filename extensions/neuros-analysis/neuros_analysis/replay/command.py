@@ -37,7 +37,6 @@ _EXIT_CODES = {"different": 1, "not replayed": 4, "unknown": 2, "identical": 0}
 
 
 def add_replay(replay: argparse.ArgumentParser) -> None:
-    """Add the options of the command."""
     replay.description = (
         "Run every node of a recorded run again on exactly the packets that it received, and"
         " compare what it sends, packet by packet. With --node: only this one. With --topic:"
@@ -141,7 +140,6 @@ def add_replay(replay: argparse.ArgumentParser) -> None:
 
 
 def add_replayed(replayed: argparse.ArgumentParser) -> None:
-    """Add the arguments of the program that replays one node."""
     replayed.add_argument("node_file")
     replayed.add_argument("--run", required=True)
     replayed.add_argument("--pdb", action="store_true")

@@ -195,7 +195,6 @@ class RecordedNode:
         return found
 
     def message(self, data: bytes, type_name: str) -> Any:
-        """A message of a type that the bag has."""
         return self._bag.message(data, type_name)
 
     def _packets(self, topic: str) -> Sequence[Any]:
@@ -240,7 +239,6 @@ class RecordedNode:
             )
 
     def _topic(self, name: str) -> str:
-        """The external topic of an input."""
         topic = self._file.node.input(name).external_topic or ""
         return self._file.names.resolve(topic, self._name)
 

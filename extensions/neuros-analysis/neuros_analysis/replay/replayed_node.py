@@ -93,7 +93,6 @@ class Comparison:
         return sum(len(stream.topics) for stream in self._streams)
 
     def stream(self, way: Way, name: str) -> int | None:
-        """The number of a stream; ``None`` if the run has not recorded it."""
         return self._numbers.get((way, name))
 
     def keep(
@@ -271,7 +270,19 @@ class ReplayedNode:
     def offer(self) -> None:
         """Give the engine packets of a world that runs by itself, or of a thread of the plugin."""
         if self._worlds:
-            self._offer_of_world()
+            if len(self._worlds) > 1:
+                raise ReplayParted(
+                    f"{len(self._worlds)} worlds of the node run by themselves, and the run does"
+                    " not tell which of them sent packets when"
+                )
+            packets: Mapping[str, Any] = {}
+            try:
+                while not packets:
+                    packets = self._worlds[0]()
+            except NeurosError as error:
+                self._fail(self._file.node.name, error)
+            else:
+                self._engine.offer(packets, lambda: None)
             return
         self._engine.has_offer = False
         while not self._engine.has_offer:
@@ -288,21 +299,6 @@ class ReplayedNode:
     def _drive(self, advance: Advance) -> bool:
         self._worlds.append(advance)
         return True
-
-    def _offer_of_world(self) -> None:
-        if len(self._worlds) > 1:
-            raise ReplayParted(
-                f"{len(self._worlds)} worlds of the node run by themselves, and the run does not"
-                " tell which of them sent packets when"
-            )
-        packets: Mapping[str, Any] = {}
-        try:
-            while not packets:
-                packets = self._worlds[0]()
-        except NeurosError as error:
-            self._fail(self._file.node.name, error)
-        else:
-            self._engine.offer(packets, lambda: None)
 
     @property
     def _engine(self) -> ReplayedEngine:

@@ -138,7 +138,6 @@ class Script:
         self._in_event += 1
 
     def events(self) -> Iterator[Event]:
-        """The events, in their order."""
         for event in self._events:
             self._readings = iter(event.readings)
             self._hook_readings = iter(event.hook_readings)
