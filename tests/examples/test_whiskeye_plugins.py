@@ -121,6 +121,15 @@ class TestPlot:
             plot.redraw_if_due({}, {})
         assert plot.redraws == 3
 
+    def test_while_it_runs_the_end_of_a_long_run_is_drawn(self, plot_module, monkeypatch):
+        monkeypatch.setattr(plot_module, "MOST_DRAWN", 100)
+        plot, series = plot_module.HeadingPlot(), turning(1.0, 1000)
+        monkeypatch.setattr(plot, "redraw", lambda *drawn: seen.append(drawn))
+        seen = []
+        plot.redraw_if_due(series, series)
+        (drawn,) = seen
+        assert [sorted(each) for each in drawn] == [sorted(series)[-100:]] * 2
+
     def test_the_picture_is_saved(self, plot_module, tmp_path):
         plot = plot_module.HeadingPlot()
         plot.redraw(turning(1.0, 400), turning(1.0, 300))
