@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import json
 import os
@@ -18,9 +17,9 @@ from typing import Any
 import pytest
 from deadlines import wait_until
 from launching import BACKENDS, EXAMPLES, Finished, Running, launch, start
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader, make_reader
+from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from recordings import flushed
 from ros_program import RosProgram
 from rosbags.rosbag2 import Reader
 from rosgraph_msgs.msg import Clock
@@ -309,18 +308,6 @@ def processes_of(run: Path) -> dict[int, str]:
     return found
 
 
-def flushed(run: Path) -> int:
-    """How many packets mcap reads in a bag that is not complete."""
-    count = 0
-    with (
-        contextlib.suppress(McapError, FileNotFoundError),
-        (run / "bag/bag.mcap").open("rb") as file,
-    ):
-        for _ in NonSeekingReader(file).iter_messages(log_time_order=False):
-            count += 1
-    return count
-
-
 @pytest.fixture
 def endless(tmp_path: Path) -> Iterator[tuple[Running, Path]]:
     """A run that goes on and on, with packets in its bag."""
@@ -330,7 +317,7 @@ def endless(tmp_path: Path) -> Iterator[tuple[Running, Path]]:
         *("-r", "-o", str(run), "--set", "nodes.source.environment.COUNT=1000000"),
         cwd=tmp_path,
     ) as running:
-        wait_until(lambda: flushed(run) > 100)
+        wait_until(lambda: flushed(run).total() > 100)
         yield running, run
 
 
@@ -377,7 +364,7 @@ def test_everything_killed_at_once_leaves_the_packets_up_to_the_last_flush(
         os.kill(pid, signal.SIGKILL)
     os.kill(running.process.pid, signal.SIGKILL)
     wait_until(lambda: not processes_of(run))
-    count = flushed(run)
+    count = flushed(run).total()
     assert count > 100
     # A process closes its files a moment after its command line is gone.
     wait_until(lambda: main(["bag", "repair", str(run)]) == 0)

@@ -1,9 +1,14 @@
-"""Recordings made by hand: spools as nodes write them, and a plan for them."""
+"""Recordings made by hand: spools as nodes write them, and a plan for them; bags so far."""
 
 from __future__ import annotations
 
+import contextlib
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader
 
 from neuros.recording.recorder import Recorder
 from neuros.recording.recording_plan import RecordedStream, RecordingPlan, Topic
@@ -58,3 +63,15 @@ def record(run: Path, what: RecordingPlan) -> Recorder:
 def fail(text: str) -> None:
     """For recordings in which nothing may go wrong."""
     raise AssertionError(text)
+
+
+def flushed(run: Path) -> Counter[str]:
+    """How many packets of each topic mcap reads in a bag that is not complete."""
+    counts: Counter[str] = Counter()
+    with (
+        contextlib.suppress(McapError, FileNotFoundError),
+        (run / "bag/bag.mcap").open("rb") as file,
+    ):
+        for _, channel, _ in NonSeekingReader(file).iter_messages(log_time_order=False):
+            counts[channel.topic] += 1
+    return counts

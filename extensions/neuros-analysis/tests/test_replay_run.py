@@ -15,6 +15,7 @@ import pytest
 from commands import neuros
 from deadlines import wait_until
 from launching import BACKENDS, EXAMPLES, launch, start
+from recordings import flushed
 from replaying import MIXER, Recorded, copied, node, record, replay, wire, write_project
 
 DEADLINE_S = 120.0
@@ -361,13 +362,13 @@ def test_a_run_that_was_killed_is_replayed_as_far_as_it_was_kept(what: str, tmp_
         refused = neuros("replay", run)
         assert refused.returncode == 4, refused.stdout + refused.stderr
         assert "is still being recorded: wait for its end" in refused.stderr
+        wait_until(lambda: is_kept(run), DEADLINE_S)
         if what == "everything":
             for process in processes_of(run):
                 os.kill(process, signal.SIGKILL)
         running.signal(signal.SIGKILL)
-    wait_until(
-        lambda: not processes_of(run), DEADLINE_S
-    )  # nodes end by themselves without a launcher
+    # Nodes end by themselves without a launcher.
+    wait_until(lambda: not processes_of(run), DEADLINE_S)
     done = neuros("replay", run)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "note: the launcher of the run was killed" in done.stdout
@@ -378,6 +379,13 @@ def test_a_run_that_was_killed_is_replayed_as_far_as_it_was_kept(what: str, tmp_
 
 def event_logs(folder: Path) -> list[Path]:
     return [*folder.glob("runs/*/*/*/packets/event_log")]
+
+
+def is_kept(run: Path) -> bool:
+    """Whether some packets of all four topics, and some events of both nodes, are in files."""
+    packets = flushed(run).values()
+    logs = [file.stat().st_size for file in run.glob("*/packets/event_log")]
+    return len(packets) == 4 and min(packets) > 20 and min(logs) > 4096
 
 
 def processes_of(run: Path) -> list[int]:
