@@ -28,11 +28,11 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 53_250)
+    hold("lines of neuros/", lines(NEUROS), 53_270)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 74_710)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 74_730)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
