@@ -65,8 +65,7 @@ _PATIENCE_S = 60.0
 _PROGRESS_S = 1.0
 # A process has 5 s to end, also on a busy machine, and leaves ROS meanwhile.
 _PATIENCE_AT_END_S = 2.0
-_LENGTH = struct.Struct("!i")
-"""Before each message, as ``multiprocessing.connection`` reads it."""
+_LENGTH = struct.Struct("!I")
 # The program needs no ROS: ros-wheels must not restart it to find ROS's libraries.
 _ENVIRONMENT = {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
 

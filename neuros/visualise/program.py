@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import os
+import pickle
+import select
 import signal
+import struct
 import sys
 import time
 from bisect import bisect_right
-from collections.abc import Mapping, Sequence
-from multiprocessing.connection import Connection
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -370,7 +371,33 @@ def _has_display(environ: Mapping[str, str]) -> bool:
 
 _REDRAW_S = 0.2
 _EVENTS_S = 0.05
-_MOST_AT_ONCE = 1000
+_READ_BYTES = 1 << 20
+_LENGTH = struct.Struct("!I")
+
+
+class MessageReader:
+    """Splits the data of a file descriptor into messages."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._data = bytearray()
+        self.is_over = False
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether data can be read, now or within the timeout."""
+        return bool(select.select([self._descriptor], [], [], timeout_s)[0])
+
+    def read(self) -> Iterator[tuple[Any, ...]]:
+        """The messages that are complete after one read; only the node's process writes them."""
+        data = os.read(self._descriptor, _READ_BYTES)
+        self.is_over = not data
+        self._data += data
+        while len(self._data) >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(self._data)
+            if len(self._data) < _LENGTH.size + length:
+                return
+            yield pickle.loads(self._data[_LENGTH.size : _LENGTH.size + length])
+            del self._data[: _LENGTH.size + length]
 
 
 class Drawing:
@@ -447,23 +474,18 @@ def main() -> None:
     """Draw until the node has gone, and save."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the end of the node ends the stream of messages
-    messages = Connection(0, writable=False)
+    messages = MessageReader(0)
     drawing: Drawing | None = None
     pause_s = _EVENTS_S
-    with contextlib.suppress(EOFError, OSError):  # the node has ended, in the midst of a message
-        while True:
-            wait_s = pause_s
-            for _ in range(_MOST_AT_ONCE):
-                if not messages.poll(wait_s):
-                    break
-                message = messages.recv()
+    while not messages.is_over:
+        if messages.wait(pause_s):
+            for message in messages.read():
                 if message[0] == "figure":
                     drawing = Drawing(*message[1:])
                 elif drawing is not None:
                     drawing.receive(*message)
-                wait_s = 0.0
-            if drawing is not None:
-                pause_s = drawing.update()
+        if drawing is not None:
+            pause_s = drawing.update()
     if drawing is not None:
         drawing.draw_and_save()
 
