@@ -20,6 +20,7 @@ import numpy as np
 from neuros.distribution import install_command
 from neuros.errors import EnvironmentFault, NodeError
 from neuros.snn.coding import (
+    Floats,
     Indices,
     Spikes,
     checked_indices,
@@ -460,3 +461,44 @@ class SpikeReader:
         if senders.size:
             self._stepper.clear(self._recorder)
         return Spikes(self._order[np.searchsorted(self._ids, senders)], time_ns / NS_PER_S)
+
+
+class Weights:
+    """The weights of the synapses from each neuron of one population to each of another one.
+
+    Make it when the network is complete, before its first step: NEST sorts its synapses when it
+    first prepares to simulate, and a handle from before then means another synapse.
+
+    Args:
+        sources, targets: ``NodeCollection`` of ``n`` and of ``m`` neurons.
+
+    Raises:
+        ValueError: the number of synapses is not ``n * m``.
+    """
+
+    def __init__(self, sources: Any, targets: Any) -> None:
+        nest = import_nest()
+        nest.Prepare()
+        nest.Cleanup()
+        self._synapses = nest.GetConnections(sources, targets)
+        self._shape = len(sources), len(targets)
+        if len(self._synapses) != len(sources) * len(targets):
+            raise ValueError(
+                f"{len(self._synapses)} synapses from {len(sources)} neurons to {len(targets)}: "
+                "there must be one from each to each"
+            )
+        ends = self._synapses.get(["source", "target"])
+        self._order = np.lexsort((ends["target"], ends["source"]))
+
+    def read(self) -> Floats:
+        """``(n, m)``, a row per source, in the unit of the model; neurons in the order of ids."""
+        return np.array(self._synapses.weight, float)[self._order].reshape(self._shape)
+
+    def write(self, values: object) -> None:
+        """Set all weights, ``(n, m)``. Raises ``ValueError`` where the shape is another one."""
+        given = np.asarray(values, float)
+        if given.shape != self._shape:
+            raise ValueError(f"weights of shape {given.shape}, not {self._shape}")
+        weights = np.empty(given.size)
+        weights[self._order] = given.ravel()
+        self._synapses.weight = weights

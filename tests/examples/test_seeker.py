@@ -62,16 +62,6 @@ def test_the_eye_on_the_side_of_the_lamp_sees_more(load, lamp, brighter):
         assert eyes[1 - brighter] == 0.0
 
 
-def test_weights_come_back_in_their_places(load):
-    pytest.importorskip("nest")
-    brain = load("brain").Brain(1, True, 4.0)
-    weights = np.arange(400.0).reshape(20, 20) / 10
-    brain.weights = weights
-    assert np.array_equal(brain.weights, weights)
-    sources = np.array(brain.synapses.source)
-    assert np.unique(np.array(brain.synapses.weight)[sources == sources.min()]).max() < 2.0
-
-
 def test_it_learns_by_reward_and_what_it_learnt_stays_when_frozen(load, tmp_path, monkeypatch):
     pytest.importorskip("nest")
     study = load("study")

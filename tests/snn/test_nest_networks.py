@@ -20,6 +20,7 @@ from neuros.snn import (
     SpikeReader,
     Spikes,
     Stepper,
+    Weights,
     WindowRate,
     import_nest,
     poisson_spikes,
@@ -254,6 +255,31 @@ def test_a_readers_indices_are_those_of_the_collection():
         found = reader.read().in_order()
     assert found.neuron.tolist() == [3, 0, 2]
     assert found.time_s.tolist() == pytest.approx([0.002, 0.003, 0.004])
+
+
+def test_weights_come_back_in_their_places():
+    nest = reset_kernel(1)
+    sources, targets = nest.Create("parrot_neuron", 3), nest.Create("iaf_psc_alpha", 2)
+    nest.Connect(targets, sources)
+    for number in (2, 0, 1):
+        nest.Connect(sources[number], targets)
+    weights = Weights(sources, targets)
+    given = np.arange(6.0).reshape(3, 2)
+    weights.write(given)
+    assert np.array_equal(weights.read(), given)
+    for row, column in np.ndindex(3, 2):
+        (own,) = nest.GetConnections(sources[row], targets[column])
+        assert own.weight == given[row, column]
+    with pytest.raises(ValueError, match=r"shape \(6,\), not \(3, 2\)"):
+        weights.write(given.ravel())
+
+
+def test_weights_need_a_synapse_from_each_to_each():
+    nest = reset_kernel(1)
+    neurons = nest.Create("parrot_neuron", 3)
+    nest.Connect(neurons, neurons, "one_to_one")
+    with pytest.raises(ValueError, match="3 synapses from 3 neurons to 3"):
+        Weights(neurons, neurons)
 
 
 def test_nest_is_imported_quietly_with_its_threads_fixed():

@@ -103,6 +103,7 @@ BY_NAME = {
         "cli/test_validate_command.py",
         "doctor/test_checks.py",
         "examples/test_ant.py",
+        "examples/test_gaze.py",
         "examples/test_seeker.py",
         "faults/",
         "fuzz/",

@@ -11,7 +11,7 @@ import os
 import numpy as np
 
 from neuros.hooks import Optional, neuros_finalise, neuros_function, neuros_initialise
-from neuros.snn import RateInput, SpikeReader, Stepper, derive_seed, reset_kernel
+from neuros.snn import RateInput, SpikeReader, Stepper, Weights, derive_seed, reset_kernel
 
 CELLS = 10  # in each eye, in each motor, and of dopamine
 STEP_S = 0.02
@@ -54,24 +54,9 @@ class Brain:
         self.dopamine = RateInput(dopamine, weight=1.0)
         self.stepper = Stepper()
         self.reader = SpikeReader(motors, self.stepper)
-        nest.Prepare()  # NEST sorts its connections now: their handles are valid from here on
-        nest.Cleanup()
-        self.synapses = nest.GetConnections(eyes, motors)
-        ends = self.synapses.get(["source", "target"])
-        self.order = np.lexsort((ends["target"], ends["source"]))
+        self.weights = Weights(eyes, motors)  # left cells first
         self.expected, self.share = 0.0, STEP_S / expect_s
         self.wheels = np.zeros(2)
-
-    @property
-    def weights(self):
-        """In pA, from each cell of an eye (row) to each cell of a motor, left ones first."""
-        return np.array(self.synapses.weight)[self.order].reshape(2 * CELLS, 2 * CELLS)
-
-    @weights.setter
-    def weights(self, values):
-        weights = np.empty(values.size)
-        weights[self.order] = values.ravel()
-        self.synapses.weight = weights
 
     def step(self, light, reward):
         surprise = reward - self.expected
@@ -89,7 +74,7 @@ def start(node):
     seed = derive_seed(int(os.environ["SEED"]), node.name)
     brain = Brain(seed, os.environ["LEARN"] == "1", float(os.environ["EXPECT_S"]))
     node.set_user_data(brain)
-    node.keep("weights", lambda: brain.weights, lambda kept: setattr(brain, "weights", kept))
+    node.keep("weights", brain.weights.read, brain.weights.write)
 
 
 @neuros_function(inputs=["eyes", "reward"], outputs=["wheels", Optional("weights")])
@@ -97,7 +82,7 @@ def act(node, eyes, reward):
     brain = node.get_user_data()
     wheels = brain.step(eyes, reward[0])
     is_due = brain.stepper.time_ns % WEIGHTS_EVERY_NS == 0
-    return wheels, brain.weights if is_due else None
+    return wheels, brain.weights.read() if is_due else None
 
 
 @neuros_finalise()
