@@ -28,15 +28,15 @@ def hold(what: str, found: float, ceiling: float) -> None:
 
 
 def test_lines_of_the_core() -> None:
-    hold("lines of neuros/", lines(NEUROS), 53_650)
+    hold("lines of neuros/", lines(NEUROS), 53_760)
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 75_270)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 75_380)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 94_020)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 94_240)
 
 
 def test_private_functions_that_are_used_once() -> None:
