@@ -233,6 +233,12 @@ class NodeLoop(NodeEvents, Protocol):
     def at(self, time_ns: int, event: Callable[[], None]) -> None:
         """Handle an event at a time, or now if that has passed."""
 
+    def after(self, duration_ns: int, event: Callable[[], None]) -> None:
+        """Handle an event so long from now, before everything else at that instant."""
+
+    def lost(self, connection: Connection) -> int:
+        """How many packets of the node are lost on a connection, or will be."""
+
     def begin(self) -> None:
         """Time 0 of the run has come."""
 
@@ -262,6 +268,12 @@ class VirtualRun(EventLoop, Protocol):
 
     def call_at(self, time_s: float, event: Callable[[], None]) -> None:
         """Call ``event`` so long after time 0, before anything else happens at that time."""
+
+    def rest(self, time_ns: int) -> None:
+        """Nothing moves in the run any more: it is this time in all nodes."""
+
+    def go_on(self, *, is_stepped: bool) -> None:
+        """A pause ends, now in all nodes of the run; ``is_stepped``: until nothing moves."""
 
 
 class StatePublisher(Protocol):

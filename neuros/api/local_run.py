@@ -183,13 +183,21 @@ class LocalRun:
         with self._thread:
             self._deliver_sent()
             self._is_behind = True
-            for node in self._nodes.values():
-                node.resume()
+            nodes = self._nodes.values()
             try:
-                self._loop.run_for(duration_s)
+                if self._plan.project.is_virtual:
+                    for node in nodes:
+                        node.run_for(round(duration_s * 1e9))
+                    self._loop.run_until_idle()
+                else:
+                    for node in nodes:
+                        node.resume()
+                    try:
+                        self._loop.run_for(duration_s)
+                    finally:
+                        for node in nodes:
+                            node.pause()
             finally:
-                for node in self._nodes.values():
-                    node.pause()
                 self._outcome.paused_s -= time.monotonic() - began_s
             self._come_to_rest()
         return self._rest(known)
@@ -335,7 +343,7 @@ class LocalRun:
         """Handle events until none waits, then take back what hooks could not use of a round."""
         self._loop.run_until_idle()
         self._is_behind = False
-        for node in self._nodes.values():
+        for node in self._nodes.values() if self._end is None else ():  # else the run drains
             node.loaded.pause()
 
     def _deliver_sent(self) -> None:

@@ -372,7 +372,7 @@ class Project:
                 else:
                     live = self._live(held, messages, own, is_held=True, fork=fork)
                     live.begin()
-                    run = LaunchedRun(live, len(project.nodes))
+                    run = LaunchedRun(live, project)
                 return Held(run, project, frozenset(inputs), messages.paths)
 
             return Prepared(project, start, is_stepped=options.backend == LOCAL)
@@ -411,11 +411,6 @@ class Project:
             PluginText(node.name, node.hooks)  # fails before there is a run folder
         plan = replace(make_plan(project, messages, options), is_held=is_held)
         plan = replace(plan, fork=fork or {}, changes=changes)
-        if is_held and project.is_virtual and not plan.back_end.is_one_process:
-            raise UsageError(
-                f"backend: a session cannot hold nodes of the back end {plan.back_end.name} in"
-                " virtual time, since they are in several processes: leave backend out"
-            )
         if options.isolate and not plan.back_end.has_own_network:
             raise UsageError(
                 "isolate: a Python program cannot give a run a network of its own: use"

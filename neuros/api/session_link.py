@@ -78,14 +78,14 @@ class HeldRun(Protocol):
         Args:
             end_s: how long to wait at most (monotonic, seconds).
             end_sim_s: no round begins at this simulated time; where the nodes are in processes of
-                their own, some may.
+                their own, some may in real time.
 
         Raises:
             TimeoutError: if it takes longer; what goes on is waited for by the next call.
         """
 
     def run_for(self, duration_s: float, known: Mapping[str, int]) -> AtRest | None:
-        """Let the run go freely for a wall time, then hold it again, and wait for that."""
+        """Let the run go freely for a time of its clock, then hold it again, and wait for that."""
 
     def deliver(self, node: str, port: Port, packet: Any) -> None:
         """Put a packet, which has been checked, into the queue of an input."""
@@ -153,10 +153,11 @@ class LaunchedRun:
 
     error = None
 
-    def __init__(self, live: LiveRun, nodes: int) -> None:
+    def __init__(self, live: LiveRun, project: Project) -> None:
         self.folder = live.folder
         self._live = live
-        self._nodes = nodes
+        self._nodes = len(project.nodes)
+        self._is_virtual = project.is_virtual
         self._packets = RosPackets()
         self._arrivals = Arrivals()
         self._number = self._answered = 0
@@ -184,8 +185,21 @@ class LaunchedRun:
         end_s: float | None = None,
         end_sim_s: float | None = None,
     ) -> AtRest | None:
+        if not self._is_virtual or rounds <= 1:
+            return self._advance(rounds, known, end_s)
+        for _ in range(rounds):  # a round begins when nothing moves, which is a virtual time
+            found = self._advance(1, {}, end_s)
+            if found is None:
+                return None
+            if end_sim_s is not None and max(found.sim_times.values(), default=0.0) >= end_sim_s:
+                break
+        return self._advance(0, known, end_s)
+
+    def _advance(
+        self, rounds: int, known: Mapping[str, int], end_s: float | None, virtual_ns: int = 0
+    ) -> AtRest | None:
         self._number += 1
-        self._send(Advance(self._number, rounds, known))
+        self._send(Advance(self._number, rounds, known, virtual_ns))
         for message in self._messages(end_s):
             if isinstance(message, AtRest) and message.number == self._number:
                 self._answered = self._number
@@ -193,6 +207,8 @@ class LaunchedRun:
         return None
 
     def run_for(self, duration_s: float, known: Mapping[str, int]) -> AtRest | None:
+        if self._is_virtual:
+            return self._advance(0, known, None, round(duration_s * 1e9))
         self._send(Resume())
         try:
             with contextlib.suppress(TimeoutError):

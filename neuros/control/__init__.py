@@ -183,7 +183,7 @@ class NodeProbe(
         is_startable: whether a hook could start on a packet that has arrived.
         is_wakeable: whether a timer, a thread or an external input may wake the node.
         is_idle: whether no event waits in its process.
-        is_virtual: whether it runs in virtual time.
+        virtual_ns: the time of the node, ``None`` in real time.
     """
 
     sent: Mapping[str, tuple[int, int]] = {}
@@ -196,7 +196,7 @@ class NodeProbe(
     is_startable: bool = False
     is_wakeable: bool = False
     is_idle: bool = True
-    is_virtual: bool = False
+    virtual_ns: int | None = None
 
 
 class Probed(Message):
@@ -352,7 +352,12 @@ class Leave(Message):
 
 
 class Pause(Message):
-    """Start no further hook."""
+    """Start no further hook.
+
+    ``at_ns``: in virtual time, once nothing moves: the latest time of a node, which all have then.
+    """
+
+    at_ns: int | None = None
 
 
 class Resume(Message):
@@ -360,10 +365,14 @@ class Resume(Message):
 
 
 class Step(Message):
-    """While paused, run ``count`` steps; ``is_driven``, to nodes: some hook starts unasked."""
+    """While paused, run ``count`` steps; ``is_driven``, to nodes: some hook starts unasked.
+
+    ``virtual_ns``: or let the run go for so long, in virtual time.
+    """
 
     count: int
     is_driven: bool = False
+    virtual_ns: int = 0
 
 
 class GetStatus(Message):
@@ -384,11 +393,13 @@ class Advance(Message):
     Attributes:
         rounds: so many steps.
         known: outputs whose packets are asked for, and the number of the newest known packet.
+        virtual_ns: or let the run go for so long, in virtual time.
     """
 
     number: int
     rounds: int
     known: Mapping[str, int]
+    virtual_ns: int = 0
 
 
 class Reset(Message):

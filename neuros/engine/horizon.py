@@ -125,6 +125,7 @@ class Moment(NamedTuple):
         awaited: channels of acknowledgements that could change what it does.
         is_ready: whether its initialise hooks have run, but for those that wait for packets.
         zero_ns: time 0 of the run, if that has come; else -1.
+        rounds: how often the run was let go: at time 0, and at the end of each pause.
         ending: the earliest end of the run that it knows.
     """
 
@@ -136,6 +137,7 @@ class Moment(NamedTuple):
     awaited: Sequence[int] = ()
     is_ready: bool = False
     zero_ns: int = -1
+    rounds: int = 0
     ending: Ending | None = None
 
     @property
@@ -175,7 +177,8 @@ class Horizon:
 
     Attributes:
         neighbours: the nodes at the other ends of its channels.
-        begun_ns: time 0 of the run, once that has come.
+        rounds: how often the run was let go: at time 0, and at the end of each pause.
+        is_behind: whether it was let go at another node once more than here.
         causes: the nodes that keep it from the event that it asked for last.
         withholds: whether it has been patient with one of them since it last told all it had to.
     """
@@ -205,11 +208,18 @@ class Horizon:
         self._first: dict[str, tuple[int, str]] = {}
         # By neighbour, how many of its last messages brought packets, without another in between.
         self._with_packets = dict.fromkeys(self.neighbours, 0)
-        self.begun_ns: int | None = None
+        self.rounds = 0
+        self._let_go_ns = 0
         self.causes: Sequence[str] = ()
         self.withholds = False
 
     # ------------------------------------------------------------------ what happens
+
+    def let_go(self, time_ns: int) -> None:
+        """Time 0 of the run has come, or a pause ends: now, in all nodes."""
+        self.rounds += 1
+        self._let_go_ns = time_ns
+        self.handle(time_ns)
 
     def handle(self, time_ns: int) -> None:
         """The node handles events of this instant."""
@@ -365,9 +375,9 @@ class Horizon:
         return max(state.moment.now_ns for state in states.values())
 
     @property
-    def have_others_begun(self) -> bool:
-        """Whether time 0 of the run has come at another node."""
-        return any(state.moment.zero_ns >= 0 for state in self._states.values())
+    def is_behind(self) -> bool:
+        """Whether the run was let go elsewhere: what arrives from there comes later than here."""
+        return any(state.moment.rounds > self.rounds for state in self._states.values())
 
     @property
     def is_under_way(self) -> bool:
@@ -423,7 +433,7 @@ class Horizon:
             return True
         before, now = old.moment, state.moment
         since_ns = before.since_ns
-        if before.zero_ns < 0:
+        if before.rounds < now.rounds:
             return True
         if state is self._own:
             if before.ending != now.ending or self._has_sent(name, old):
@@ -465,10 +475,9 @@ class Horizon:
         """
         states, own = self._states, self._received
         first = {name: state.moment.next_ns for name, state in states.items()}
-        if self.begun_ns is not None:
-            for name, state in states.items():
-                if state.moment.zero_ns < 0:  # time 0 will have hooks of it start
-                    first[name] = min(first[name], self.begun_ns)
+        for name, state in states.items():
+            if state.moment.rounds < self.rounds:  # hooks of it will start when it is let go
+                first[name] = min(first[name], self._let_go_ns)
         for neighbour in self.neighbours:
             if neighbour not in states:
                 yield 0, neighbour, neighbour

@@ -218,10 +218,10 @@ class PauseState:
         """The pause is over without a request: nodes that drain go on by themselves."""
         self._before_s, self.since_s = self.total_s, None
 
-    def step(self, count: int, *, is_driven: bool) -> None:
-        """Run ``count`` steps of a paused run."""
-        if self.since_s is not None and count > 0:
-            self.send(control.Step(count, is_driven))
+    def step(self, count: int, *, is_driven: bool, virtual_ns: int = 0) -> None:
+        """Run ``count`` steps of a paused run, or let it go for a virtual time."""
+        if self.since_s is not None and (count > 0 or virtual_ns > 0):
+            self.send(control.Step(count, is_driven, virtual_ns))
 
 
 @dataclass

@@ -121,6 +121,12 @@ class Probing:
             self._packets = {}
             self._seek(Verdict.AT_REST, now_s)
 
+    @property
+    def virtual_ns(self) -> int | None:
+        """The latest time of a node in the last whole round, ``None`` in real time."""
+        times = (probe.virtual_ns for probe in self._answers.values())
+        return max((each for each in times if each is not None), default=None)
+
     def end_rest(self) -> control.AtRest:
         """The answer to the session, once it is at rest or waits for that no more."""
         nodes = self._answers.items()
@@ -268,7 +274,8 @@ def is_drained(probes: Probes, connections: Sequence[Connection]) -> bool:
     In virtual time, all that happens counts, so no packet at all may be under way.
     """
     return not under_way(probes, connections) and not any(
-        probe.is_startable or (probe.is_virtual and not probe.is_idle) for probe in probes.values()
+        probe.is_startable or (probe.virtual_ns is not None and not probe.is_idle)
+        for probe in probes.values()
     )
 
 
@@ -282,14 +289,16 @@ def is_dead(probes: Probes, connections: Sequence[Connection]) -> bool:
 def is_at_rest(probes: Probes, connections: Sequence[Connection], same_s: float) -> bool:
     """Whether nothing moves in a paused run whose nodes have all been started.
 
-    ``same_s``: for how long the counters have been the same, in seconds.
+    ``same_s``: for how long the counters have been the same, in seconds. In virtual time, packets
+    that are lost are not counted as sent.
     """
     under_way = [
         connection.is_reliable
         for connection, sent, received in _ends(probes, connections)
         if (sent != received if connection.is_reliable else sent[0] != received[0])
     ]
-    has_lost = bool(under_way) and not any(under_way)
+    is_virtual = any(probe.virtual_ns is not None for probe in probes.values())
+    has_lost = bool(under_way) and not any(under_way) and not is_virtual
     return all(probe.is_active for probe in probes.values()) and (
         not under_way or (has_lost and same_s >= _LOST_AFTER_S)
     )

@@ -286,7 +286,7 @@ class Supervisor:
                 self._probing.add(message, now_s)
                 if self._session is not None and self._probing.verdict is Verdict.AT_REST:
                     # A pause takes back what hooks could not use of a step.
-                    self._channels.send(control.Pause())
+                    self._channels.send(control.Pause(self._probing.virtual_ns))
                     self._channels.send_to(self._session, self._probing.end_rest())
                     self._session = None
             case control.Hello(nodes, plugins):
@@ -322,7 +322,8 @@ class Supervisor:
             case control.StateOfPeer(node, text):
                 self._peers.receive(node, text, now_s)
             case control.Advance():
-                self.pause.step(message.rounds, is_driven=self._detector.is_driven)
+                is_driven, virtual_ns = self._detector.is_driven, message.virtual_ns
+                self.pause.step(message.rounds, is_driven=is_driven, virtual_ns=virtual_ns)
                 if self.phase in _BEFORE_END:  # else the session hears of the end
                     self._session = link
                     self._probing.await_rest(message, now_s)

@@ -368,6 +368,12 @@ class NodeRuntime:
         """Go on after a pause."""
         self._guard(self.loaded.resume)
 
+    def run_for(self, duration_ns: int) -> None:
+        """Go on after a pause, in virtual time, and pause again after so long."""
+        assert self._virtual is not None
+        self.resume()
+        self._virtual.after(duration_ns, self.pause)
+
     def step(self, count: int, *, is_driven: bool) -> None:
         """While paused, let each hook that drives the project start ``count`` times."""
         try:

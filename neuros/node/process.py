@@ -129,6 +129,7 @@ class NodeProcess:
         self._contexts = ContextSwitch()
         self._nodes: dict[str, NodeRuntime] = {}
         self._middleware: Middleware | None = None
+        self._virtual: VirtualRun | None = None
         self._early_events: list[Event] = []
         self._early_lock = threading.Lock()
         self._stage, self._stage_lock = ProcessStage.LOADING, threading.Lock()
@@ -219,18 +220,27 @@ class NodeProcess:
                     node.pause()  # takes back what is left of steps, which might go on for ever
                 self._when_idle(lambda: self._reset(message))
             case control.Drain(last_round, is_asked):
+                if any(node.is_paused for node in nodes):
+                    self._go_on(is_stepped=False)
                 for node in nodes:
                     node.drain(last_round.get(node.name, ()), is_asked=is_asked)
-            case control.Pause():
+            case control.Pause(at_ns):
+                if at_ns is not None and self._virtual is not None:
+                    self._virtual.rest(at_ns)
                 for node in nodes:
                     node.pause()
             case control.Resume():
                 self._asked = None  # where the run goes freely, an answer would hold it again
+                self._go_on(is_stepped=False)
                 for node in nodes:
                     node.resume()
-            case control.Step(count, is_driven):
+            case control.Step(count, is_driven, virtual_ns):
+                self._go_on(is_stepped=True)
                 for node in nodes:
-                    node.step(count, is_driven=is_driven)
+                    if virtual_ns:
+                        node.run_for(virtual_ns)
+                    else:
+                        node.step(count, is_driven=is_driven)
             case control.Deliver(name, input_name, data) if name in self._nodes:
                 self._nodes[name].deliver(input_name, data)
             case control.Change(name) if name in self._nodes:
@@ -362,7 +372,7 @@ class NodeProcess:
         try:
             middleware = self._make_middleware(self._files, self._fail_outside_hooks)
             if self._files[0].time == VIRTUAL:
-                loop = cast(VirtualRun, middleware.loop)
+                loop = self._virtual = cast(VirtualRun, middleware.loop)
                 loop.plan(self._duration_s, self._end_by_duration, self._real_time_factor)
                 if self._fork is not None:
                     loop.call_at(self._fork[0], functools.partial(self._change, only_checks=False))
@@ -389,6 +399,10 @@ class NodeProcess:
         if not self.is_ending:
             self._guard(middleware.loop.run)
             middleware.take_in()
+
+    def _go_on(self, *, is_stepped: bool) -> None:
+        if self._virtual is not None:
+            self._virtual.go_on(is_stepped=is_stepped)
 
     def _begin(self) -> None:
         self._has_begun = True

@@ -16,7 +16,7 @@ from neuros.node.instruments import NodeRecorder
 from neuros.node.logs import PacketLog, WorldLog
 from neuros.node.sampling import Sampler
 from neuros.node.simulated_time import SimulatedTime
-from neuros.ports import Logger, Middleware, Transport, WorldLook
+from neuros.ports import Logger, Middleware, NodeLoop, Transport, WorldLook
 from neuros.project.model import Connection, NodeFile
 from neuros.project.names import SESSION
 from neuros.project.timing import VIRTUAL
@@ -164,7 +164,7 @@ class NodeReports:
             is_startable=engine.has_startable_packet,
             is_wakeable=is_wakeable,
             is_idle=is_idle,
-            is_virtual=self._file.time == VIRTUAL,
+            virtual_ns=at_rest.virtual_ns,
         )
 
     def probe_at_rest(self, here: Container[str]) -> control.NodeProbe:
@@ -174,9 +174,11 @@ class NodeReports:
         """
         engine = self._engine
         assert engine is not None
+        loop = self._middleware.loop_of(self._file)
+        lost = cast(NodeLoop, loop).lost if self._file.time == VIRTUAL else lambda _: 0
         return control.NodeProbe(
             sent={
-                str(window.connection): (window.sent, window.acknowledged)
+                str(window.connection): (window.sent - lost(window.connection), window.acknowledged)
                 for window in engine.send_windows.values()
                 if window.connection.destination_node not in here
             },
@@ -187,6 +189,7 @@ class NodeReports:
             },
             sim_time=self._time.now_s,
             is_active=engine.is_active,
+            virtual_ns=self._clock() if self._file.time == VIRTUAL else None,
         )
 
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import queue
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -52,6 +53,7 @@ class NodeTime:
         self._place = place
         self._events: list[tuple[int, int, int, int, Event]] = []
         self._count = 0
+        self._lost: Counter[Connection] = Counter()
         self._timers: list[tuple[Callable[[], int | None], Event]] = []
         self.queued_ns: int | None = None
         self.now_ns = self.instant_ns = 0
@@ -139,6 +141,18 @@ class NodeTime:
         heappush(self._events, (time_ns, _ARRIVAL, index, number, event))
         self._loop.queue(self, self._place)
 
+    def after(self, duration_ns: int, event: Event) -> None:
+        """Handle an event so long from now, before everything else at that instant."""
+        self._add(self.now_ns + duration_ns, _CONTROL, event)
+
+    def lose(self, connection: Connection) -> None:
+        """Count a packet of the node that will be lost."""
+        self._lost[connection] += 1
+
+    def lost(self, connection: Connection) -> int:
+        """How many were, on a connection."""
+        return self._lost[connection]
+
     # ------------------------------------------------------------------ for the loop
 
     @property
@@ -202,6 +216,8 @@ class VirtualLoop(LocalLoop):
 
     def __init__(self, seed: str) -> None:
         super().__init__(lambda: self.now_ns)
+        self._loop_backs: deque[Event] = deque()  # for when nothing is left to do, or may be
+        self.post_loop_back = self._loop_backs.append
         self.seed = seed
         self._duration: tuple[int, Event] | None = None
         self._factor: float | None = None
@@ -261,10 +277,18 @@ class VirtualLoop(LocalLoop):
     def synchronise(self) -> None:
         """Let time pass in all nodes up to the latest instant, so that they have one time."""
         if self._next_node() is None:
-            self.now_ns = max((node.now_ns for node in self._nodes), default=self.now_ns)
+            self.now_ns = max(self.now_ns, *(node.now_ns for node in self._nodes), 0)
         for place, node in enumerate(self._nodes):
             node.wait_until(self.now_ns)
             self.queue(node, place)
+
+    def rest(self, time_ns: int) -> None:
+        """Nothing moves in the run any more: it is this time in all nodes."""
+        self.now_ns = max(self.now_ns, time_ns)
+        self.synchronise()
+
+    def go_on(self, *, is_stepped: bool) -> None:
+        """A pause ends, now in all nodes of the run; ``is_stepped``: until nothing moves."""
 
     def plan(self, duration_s: float | None, on_end: Event, real_time_factor: float | None) -> None:
         """Call ``on_end`` at the end of a duration from time 0; go no faster than the factor.
@@ -357,22 +381,9 @@ class VirtualLoop(LocalLoop):
             """Until no node has an event."""
         self.synchronise()
 
-    def run_for(self, seconds: float) -> None:
-        self.synchronise()
-        self.limit_ns = end_ns = self.now_ns + round(seconds * 1e9)
-        while self.limit_ns is not None and self.step():
-            """Until the time has come, or :meth:`end_run`."""
-        if self.limit_ns is not None and not self._is_stopping:
-            self.now_ns = end_ns
-        self.limit_ns = None
-        self.synchronise()
-
-    def end_run(self) -> None:
-        self.limit_ns = None
-
     def run(self) -> None:
         while not self._is_stopping:
-            if not self.step():
+            if not self.step() and not self._loop_back():
                 self.wait(None)
 
     def take_in(self) -> None:
@@ -385,6 +396,12 @@ class VirtualLoop(LocalLoop):
             self._events.append(self._from_threads.get(timeout=seconds))
         except queue.Empty:
             return
+
+    def _loop_back(self) -> bool:
+        """Handle events that waited until nothing is left to do; returns whether others follow."""
+        for _ in range(len(self._loop_backs)):
+            self._loop_backs.popleft()()
+        return bool(self._events)
 
     def _may_handle(self, time_ns: int) -> bool:
         """Whether nothing can arrive any more before the events of a time."""

@@ -162,7 +162,7 @@ class RosVirtualLoop(VirtualLoop):
         ros.add_timer(self._patience_ends_ns, self._lose_patience)
         self._at_zero: Event | None = None
         self._drain: Event | None = None  # what a node does when the end reaches it
-        self._is_draining = False
+        self._is_draining = self._is_stepped = False
 
     # ------------------------------------------------------------------ what the node asks for
 
@@ -170,6 +170,10 @@ class RosVirtualLoop(VirtualLoop):
         """Handle an event at time 0 of the run, which is the same for all nodes."""
         self._at_zero = event
         self._wake()
+
+    def go_on(self, *, is_stepped: bool) -> None:
+        self._is_stepped = is_stepped
+        self.horizon.let_go(self.now_ns)
 
     def drain_when_known(self, drain: Event, is_asked: bool) -> None:
         """Drain at the time of the end, which another node may have asked for."""
@@ -244,7 +248,8 @@ class RosVirtualLoop(VirtualLoop):
             if zero_ns is not None:
                 event, self._at_zero = self._at_zero, None
                 self._nodes[0].wait_until(zero_ns)
-                self.now_ns = self.horizon.begun_ns = zero_ns
+                self.now_ns = zero_ns
+                self.horizon.let_go(zero_ns)
                 event()
                 return True
         if self._drain is not None and self._end is not None:
@@ -297,21 +302,16 @@ class RosVirtualLoop(VirtualLoop):
     def _make_node(self, name: str, place: int) -> NodeTime:
         return RosNodeTime(self, name, place)
 
-    @property
-    def _is_behind_time_0(self) -> bool:
-        """Whether time 0 has come elsewhere: what arrives from there is later."""
-        return not self.has_begun and self.horizon.have_others_begun
-
     def _is_first(self, time_ns: int) -> bool:
         causes = self.horizon.behind(time_ns)
         self._waits_ns = time_ns if causes else -1
         return not causes
 
     def _can_go_on(self) -> bool:
-        return not self._is_behind_time_0 and super()._can_go_on()
+        return not self.horizon.is_behind and super()._can_go_on()
 
     def _may_handle(self, time_ns: int) -> bool:
-        if self._is_behind_time_0:
+        if self.horizon.is_behind:
             return False
         other = self.horizon.waits_for(time_ns, self.find_awaited())
         self._waits_ns = time_ns if other else -1
@@ -323,6 +323,10 @@ class RosVirtualLoop(VirtualLoop):
             )
         return not other
 
+    @property
+    def _comes_to_rest(self) -> bool:
+        return self._is_stepped or self._end is not None
+
     def _moment(self, free_ns: int | None = None) -> Moment:
         node = self._nodes[0]
         if free_ns is None:
@@ -333,10 +337,11 @@ class RosVirtualLoop(VirtualLoop):
             NEVER_NS if next_ns is None else next_ns,
             free_ns,
             *((self._waits_ns, tuple(self.horizon.causes)) if self._waits_ns >= 0 else (-1, ())),
-            # Once the run ends, all acknowledgements count: it has drained when none is left.
-            tuple(self.find_awaited() if self._end is None else self.answers),
+            # Where the run is to come to rest, all acknowledgements count: none is left then.
+            tuple(self.answers if self._comes_to_rest else self.find_awaited()),
             self.is_ready,
             self.zero_ns if self.has_begun else -1,
+            self.horizon.rounds,
             None if self._end is None else Ending(*self._end),
         )
 
@@ -354,7 +359,10 @@ class RosVirtualLoop(VirtualLoop):
             if time.monotonic_ns() > end_ns and node.next_ns != node.now_ns:
                 self._wake()
                 break
-        if self._is_draining:
+        else:
+            if self._loop_back():
+                self._wake()
+        if self._is_draining or self._is_stepped:
             self.tell_all()
         else:
             self.tell()
@@ -386,7 +394,9 @@ class VirtualSendingLink(SendingLink):
 
     def _send(self, data: bytes) -> None:
         way = self._direction.send(self._time.now_ns)
-        if way is not None:
+        if way is None:
+            self._time.lose(self._connection)
+        else:
             self._loop.horizon.send(_packets(self._connection), way[0])
             self._loop.send(self, self._connection.destination_node, data)
 

@@ -91,10 +91,15 @@ def test_packets_that_may_be_lost_do_not_hold_up_the_end_and_a_step_only_shortly
 
 
 def test_in_virtual_time_they_do_since_they_arrive_at_the_same_time_in_every_run() -> None:
-    probes = both((9, 0), (4, 0), LOSSY, is_virtual=True)
+    probes = both((9, 0), (4, 0), LOSSY, virtual_ns=0)
     assert is_drained(probes, [LOSSY])
-    probes["a"] = sender(LOSSY, 9, 0, is_idle=False, is_virtual=True)
+    probes["a"] = sender(LOSSY, 9, 0, is_idle=False, virtual_ns=0)
     assert not is_drained(probes, [LOSSY])
+
+
+def test_in_virtual_time_what_was_sent_and_not_lost_holds_up_a_step_for_however_long() -> None:
+    assert not is_at_rest(both((9, 0), (4, 0), LOSSY, virtual_ns=0), [LOSSY], 1e3)
+    assert is_at_rest(both((4, 0), (4, 0), LOSSY, virtual_ns=0), [LOSSY], 0.0)
 
 
 def test_connections_to_nodes_that_never_began_do_not_count() -> None:

@@ -47,6 +47,7 @@ BY_NAME = {
         "api/test_reset_settings.py",
         "api/test_session_forks.py",
         "api/test_session_resets.py",
+        "api/test_sessions_in_virtual_time.py",
         "api/test_stepped_sessions.py",
         "extensions/neuros-analysis/tests/test_packs.py",
         "extensions/neuros-analysis/tests/test_fork.py",
