@@ -238,5 +238,5 @@ def numbers_of(file: Path, kind: Any, columns: int = 1) -> Numbers:
         data = read_bytes(file)
     except OSError:  # the node has sent or received nothing
         data = b""
-    found = np.frombuffer(data[: len(data) // (8 * columns) * 8 * columns], dtype=kind)
+    found = np.frombuffer(data, dtype=kind, count=len(data) // (8 * columns) * columns)
     return found if columns == 1 else found.reshape(-1, columns)

@@ -1,4 +1,4 @@
-"""Each example is recorded, and its whole run is replayed: every node sends the same again."""
+"""Each example is replayed as a whole, and forked: every node sends the same again."""
 
 from __future__ import annotations
 
@@ -31,6 +31,23 @@ LONG = [
     ("6_outside/rover", "--duration", "2"),
     ("7_learning/cartpole", *SHORT),
 ]
+VIRTUAL_TIME = ("--time", "virtual")
+FORKED = [
+    ("1_tick/clock", "1", *VIRTUAL_TIME, "--duration", "2"),
+    ("2_synchronisation/tennis", "0.0005", *VIRTUAL_TIME),
+    ("2_synchronisation/voting", "0.0005", *VIRTUAL_TIME),
+    ("3_physics_simulation/elevator", "1", *VIRTUAL_TIME),
+    ("3_physics_simulation/elevator/asynchronous.json", "1", *VIRTUAL_TIME),
+    ("3_physics_simulation/elevator/no_discard_limit.json", "1", *VIRTUAL_TIME),
+    (f"{WHISKEYE}/asynchronous.json", "1", *VIRTUAL_TIME, *SHORT),
+    (f"{WHISKEYE}/custom_messages.json", "1sim", *SHORT),
+    (f"{WHISKEYE}/no_discard_limit.json", "1", *VIRTUAL_TIME, *SHORT),
+    (f"{WHISKEYE}/project.json", "1", *VIRTUAL_TIME, *SHORT),
+    (f"{WHISKEYE}/room.json", "1sim", *SHORT),
+    (f"{WHISKEYE}/strict.json", "1sim", *SHORT),
+    (f"{WHISKEYE}/tick_20ms.json", "1", *VIRTUAL_TIME, *SHORT),
+    ("7_learning/cartpole", "1", *VIRTUAL_TIME, *SHORT),
+]
 OWN_PYTHONS = ("5_containers/conflict", "--duration", "5")
 
 
@@ -40,10 +57,9 @@ def replays(options: tuple[str, ...], backend: str, folder: Path) -> None:
     command = [str(EXAMPLES / project), "--backend", backend, "-r", *others]
     run = launch(*command, cwd=folder, timeout_s=300.0)
     assert run.exit_code == 0, run.output
-    done = neuros("replay", run.run_folder)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert f"\nidentical: {len(run.record['nodes'])} node" in done.stdout
-    assert "as far as recorded" not in done.stdout
+    done = printed("replay", run.run_folder)
+    assert f"\nidentical: {len(run.record['nodes'])} node" in done
+    assert "as far as recorded" not in done
 
 
 @pytest.mark.parametrize("options", EVERY_TIME, ids=lambda options: options[0])
@@ -56,6 +72,25 @@ def test_an_example_replays(options: tuple[str, ...], tmp_path: Path) -> None:
 @pytest.mark.parametrize("options", EVERY_TIME + LONG, ids=lambda options: options[0])
 def test_each_example_replays(options: tuple[str, ...], backend: str, tmp_path: Path) -> None:
     replays(options, backend, tmp_path)
+
+
+@pytest.mark.acceptance
+@pytest.mark.parametrize("options", FORKED, ids=lambda options: options[0])
+def test_each_example_that_can_be_repeated_forks(options: tuple[str, ...], tmp_path: Path) -> None:
+    project, at, *others = options
+    command = [str(EXAMPLES / project), "--backend", "process", "--digests", *others]
+    run = launch(*command, cwd=tmp_path, timeout_s=300.0)
+    assert run.exit_code == 0, run.output
+    fork = tmp_path / "fork"
+    printed("fork", run.run_folder, "--at", at, "-o", fork)
+    assert "\nidentical: " in printed("verify", run.run_folder, fork)
+
+
+def printed(*arguments: object) -> str:
+    """What a command writes that succeeds."""
+    done = neuros(*arguments)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return f"\n{done.stdout}"
 
 
 @pytest.mark.acceptance
