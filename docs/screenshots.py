@@ -64,7 +64,7 @@ def page_of(project: Path, name: str, *arguments: str) -> Iterator[str]:
 def shoot_dashboard(page: Any) -> None:
     """WhiskEye, with a connection selected."""
     with page_of(WHISKEYE, "dashboard", "--dashboard", *LONG) as url:
-        page.set_viewport_size({**SIZE, "height": 1420})  # all panels
+        page.set_viewport_size({**SIZE, "height": 1240})  # all panels
         page.goto(url)
         page.click('#connections tr[data-name="robot.imu -> snn.imu"]')
         page.wait_for_selector('#details tr[data-name="angular_velocity.z"]', timeout=DEADLINE_MS)
