@@ -7,6 +7,7 @@ latency.
 
 from __future__ import annotations
 
+import mmap
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from xxhash import xxh3_128_hexdigest
 
+from neuros.ordinary_files import open_ordinary
 from neuros.project.model import Connection
-from neuros.project.scanner import read_bytes
 
 _COUNT = re.compile(r"[1-9][0-9]{0,17}")
 FOLDER = "packets"
@@ -233,10 +234,15 @@ def up_to_first(wrong: Numbers) -> int:
 
 
 def numbers_of(file: Path, kind: Any, columns: int = 1) -> Numbers:
-    """The complete rows of 64-bit numbers in a file, (rows, columns), or (rows,) of one column."""
+    """The complete rows of 64-bit numbers in a file, (rows, columns), or (rows,) of one column.
+
+    They are mapped: of the lists of a long run, those that nobody reads take no memory.
+    """
+    data: mmap.mmap | bytes
     try:
-        data = read_bytes(file)
-    except OSError:  # the node has sent or received nothing
+        with open_ordinary(file) as content:
+            data = mmap.mmap(content.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError):  # the node has sent or received nothing
         data = b""
     found = np.frombuffer(data, dtype=kind, count=len(data) // (8 * columns) * columns)
     return found if columns == 1 else found.reshape(-1, columns)

@@ -27,8 +27,8 @@ import numpy.typing as npt
 from neuros.bag import Bag, RecordedTopic, open_bag
 from neuros.errors import UsageError
 from neuros.node.logs import WORLD_LOG
+from neuros.ordinary_files import open_ordinary
 from neuros.project.dashboard import ARRAYS, SPIKES
-from neuros.project.scanner import read_bytes
 from neuros.project.timing import VIRTUAL
 from neuros.recording.columns import has_simulated_time
 from neuros.registry import back_end_of
@@ -362,8 +362,9 @@ def _scenes(file: Path, complain: Callable[[str], object]) -> Iterator[dict[str,
     """Each geometry that has frames, with their times and poses."""
     world = _World()
     try:
-        for line in read_bytes(file).splitlines():
-            world.add(line)
+        with open_ordinary(file) as lines:
+            for line in lines:
+                world.add(line)
     except FileNotFoundError:
         return
     except (OSError, *_DAMAGE):
