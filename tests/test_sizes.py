@@ -32,11 +32,11 @@ def test_lines_of_the_core() -> None:
 
 
 def test_lines_of_the_core_and_its_extensions() -> None:
-    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 74_960)
+    hold("lines of neuros/ and extensions/", lines(NEUROS, *EXTENSIONS), 74_970)
 
 
 def test_lines_of_tests_and_benchmarks() -> None:
-    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 94_400)
+    hold("lines of tests/ and benchmarks/", lines(*TESTS, ROOT / "benchmarks"), 94_410)
 
 
 def test_private_functions_that_are_used_once() -> None:
