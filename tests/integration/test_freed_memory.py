@@ -29,7 +29,7 @@ def page_faults_of_16_images(*variables: str) -> int:
     others = {
         name: value
         for name, value in os.environ.items()
-        if not name.startswith(("MALLOC_", "GLIBC_TUNABLES"))
+        if not name.startswith(("MALLOC_", "GLIBC_TUNABLES"))  # as Dask leaves there
     }
     done = subprocess.run(command, check=True, capture_output=True, text=True, env=others)
     return int(done.stdout)
