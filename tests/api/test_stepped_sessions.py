@@ -24,6 +24,7 @@ from cart_project import BRAIN, cart, port
 from deadlines import wait_until
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from processes import is_alive
 from std_msgs.msg import Float64, String, UInt8MultiArray
 from test_python_api import thrown
 
@@ -769,14 +770,10 @@ def test_a_program_that_is_killed_leaves_nothing(tmp_path: Path, back_end: str) 
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdout.readline() == b"held\n"
-        started = psutil.Process(process.pid).children(recursive=True)
+        started = [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
         assert started
         process.kill()
-    wait_until(lambda: not any(map(_lives, started)), DEADLINE_S)
-
-
-def _lives(process: psutil.Process) -> bool:
-    return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
+    wait_until(lambda: not any(map(is_alive, started)), DEADLINE_S)
 
 
 def test_two_threads_share_a_session(held: Session) -> None:

@@ -10,10 +10,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from deadlines import wait_until
+from processes import is_alive
 
 from neuros.backends.domain import choose_domain
 from neuros.backends.guardian import GuardedProcess, Guardian
@@ -106,21 +108,6 @@ def _processes_of(run_id: str) -> list[int]:
     return found
 
 
-def _is_alive(pid: int) -> bool:
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_bytes()
-    except OSError:
-        return False
-    return stat[stat.rindex(b")") + 2 :][:1] not in (b"Z", b"X")
-
-
-def _wait_until(condition: Callable[[], bool], deadline_s: float = 10.0) -> None:
-    end = time.monotonic() + deadline_s
-    while not condition():
-        assert time.monotonic() < end, "deadline passed"
-        time.sleep(0.01)
-
-
 def _start(run_id: str, program: str) -> subprocess.Popen[str]:
     process = subprocess.Popen(
         [sys.executable, "-S", "-c", program],
@@ -131,7 +118,7 @@ def _start(run_id: str, program: str) -> subprocess.Popen[str]:
     )
     # Popen returns before the kernel shows the environment, by which a process of a run is known.
     environment = Path(f"/proc/{process.pid}/environ")
-    _wait_until(lambda: process.poll() is not None or run_id.encode() in environment.read_bytes())
+    wait_until(lambda: process.poll() is not None or run_id.encode() in environment.read_bytes())
     return process
 
 
@@ -165,16 +152,14 @@ def test_nothing_is_left_six_seconds_after_the_launcher_was_killed(
         guardian, *hosts = [int(line) for line in iter(output.readline, "started\n")]
     sessions = set(hosts)
     # two hosts that stay, the double fork in its own session, the child with no environment
-    _wait_until(lambda: len(_processes_of(run_id)) == 3 and _has_orphan(sessions))
+    wait_until(lambda: len(_processes_of(run_id)) == 3 and _has_orphan(sessions))
     orphans = [pid for pid in _all_pids() if _session(pid) in sessions]
 
     launcher.kill()
     launcher.wait(5)
     killed_at = time.monotonic()
     everything = [guardian, *hosts, *orphans]
-    _wait_until(
-        lambda: not any(map(_is_alive, everything)) and not _processes_of(run_id), deadline_s=6
-    )
+    wait_until(lambda: not any(map(is_alive, everything)) and not _processes_of(run_id), within_s=6)
     assert time.monotonic() - killed_at > 4, "the nodes had their time to finalise"
     assert not left.exists()
 
@@ -193,7 +178,7 @@ def _session(pid: int) -> int:
 def _has_orphan(sessions: set[int]) -> bool:
     """A process in the session of a host, with an empty environment."""
     for pid in _all_pids():
-        if pid not in sessions and _session(pid) in sessions and _is_alive(pid):
+        if pid not in sessions and _session(pid) in sessions and is_alive(pid):
             command = Path(f"/proc/{pid}/cmdline").read_bytes()
             if b"time.sleep" in command and not Path(f"/proc/{pid}/environ").read_bytes():
                 return True
@@ -241,7 +226,7 @@ def test_what_the_program_of_the_launcher_has_lost_is_left_alone(
     stranger = int(mark.read_text())
     try:
         guardian.finish()
-        assert _is_alive(stranger)
+        assert is_alive(stranger)
     finally:
         os.kill(stranger, signal.SIGKILL)
 
@@ -281,7 +266,7 @@ def test_the_launcher_does_the_work_of_a_guardian_that_was_killed(
     left = tmp_path / "socket"
     left.touch()
     os.kill(guardian.pid, signal.SIGKILL)
-    _wait_until(lambda: not guardian.is_on_duty)
+    wait_until(lambda: not guardian.is_on_duty)
     guardian.remove_later(left)
     process = _start(run_id, IGNORES_SIGTERM)
     guardian.finish()
@@ -470,9 +455,9 @@ def test_what_a_fork_has_left_ends_with_the_run(
     mark = tmp_path / "pid"
     daemon = f"open({str(mark)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     forks.run(f"import os, time\nif os.fork() == 0:\n  os.setsid(); os.environ.clear(); {daemon}")
-    _wait_until(lambda: mark.exists() and mark.read_text() != "")
+    wait_until(lambda: mark.exists() and mark.read_text() != "")
     guardian.finish()
-    assert not _is_alive(int(mark.read_text()))
+    assert not is_alive(int(mark.read_text()))
 
 
 @pytest.mark.parametrize("step_s", [-3600.0, 3600.0])

@@ -7,11 +7,12 @@ import os
 import secrets
 import signal
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import pytest
+from deadlines import wait_until
+from processes import is_alive
 
 from neuros.backends import node_command
 from neuros.backends.guardian import Guardian
@@ -73,13 +74,6 @@ def run(tmp_path: Path) -> Iterator[Run]:
     run = Run(tmp_path)
     yield run
     run.guardian.finish()
-
-
-def _wait_until(condition: Callable[[], bool], deadline_s: float = 10.0) -> None:
-    end = time.monotonic() + deadline_s
-    while not condition():
-        assert time.monotonic() < end, "deadline passed"
-        time.sleep(0.01)
 
 
 def test_one_process_per_node(run: Run) -> None:
@@ -186,18 +180,11 @@ def test_terminate_asks_and_kill_does_not(run: Run) -> None:
 def test_kill_takes_the_children_along(run: Run) -> None:
     program = "import os, time; print(os.fork() or 0, flush=True); time.sleep(60)"
     (host,) = run.start(program, [run.node("snn")])
-    _wait_until(lambda: run.log("snn/node.log").count("\n") == 2)
+    wait_until(lambda: run.log("snn/node.log").count("\n") == 2)
     child = max(int(line) for line in run.log("snn/node.log").split())
     host.kill()
     host.wait(10)
-    _wait_until(lambda: not _is_alive(child))
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
+    wait_until(lambda: not is_alive(child))
 
 
 def _children_of(pid: int) -> list[int]:
@@ -213,7 +200,7 @@ def test_a_program_that_does_not_exist_is_a_fault_and_the_others_do_not_stay(run
     )
     with pytest.raises(EnvironmentFault, match=r"process of b: .*No such file.*/nowhere/python"):
         ProcessLauncher(program).start([run.node("a"), run.node("b")], {})
-    assert not any(_is_alive(pid) for pid in _children_of(run.guardian.pid))
+    assert not any(is_alive(pid) for pid in _children_of(run.guardian.pid))
 
 
 def test_what_no_process_can_be_given_is_a_fault_and_the_next_one_starts(run: Run) -> None:
@@ -225,7 +212,7 @@ def test_what_no_process_can_be_given_is_a_fault_and_the_next_one_starts(run: Ru
 def test_how_a_process_ended_is_not_known_when_its_guardian_was_killed(run: Run) -> None:
     (host,) = run.start(SLEEP, [run.node("snn")])
     os.kill(run.guardian.pid, signal.SIGKILL)
-    _wait_until(lambda: not run.guardian.is_on_duty)
+    wait_until(lambda: not run.guardian.is_on_duty)
     assert host.poll() is None
     host.kill()
     assert host.wait(10) == "how is not known, since the guardian was killed"
@@ -279,11 +266,11 @@ def test_in_process_a_script_that_fails_is_named_with_its_node(run: Run) -> None
 def test_terminate_during_a_script_ends_both(run: Run) -> None:
     script = run.script("slow.sh", "echo $$; exec sleep 60")
     (host,) = run.start("print('never')", [run.node("snn", script)])
-    _wait_until(lambda: bool(run.log("snn/node.log")))
+    wait_until(lambda: bool(run.log("snn/node.log")))
     child = int(run.log("snn/node.log"))
     host.terminate()
     assert host.wait(10) == "killed by SIGTERM"
-    _wait_until(lambda: not _is_alive(child))
+    wait_until(lambda: not is_alive(child))
 
 
 def test_what_would_be_started_can_be_described(run: Run) -> None:

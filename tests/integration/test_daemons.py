@@ -10,11 +10,11 @@ import json
 import os
 import signal
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from deadlines import wait_until
 
 from tests.support.launching import Running, start
 
@@ -76,13 +76,6 @@ def _is_daemon(pid: int) -> bool:
         return False
 
 
-def _wait_until(condition: Callable[[], bool], deadline_s: float) -> None:
-    end_s = time.monotonic() + deadline_s
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
-
-
 def _start(tmp_path: Path, marks: Path, plugin: str, backend: str, script: str = "") -> Running:
     project = tmp_path / "project"
     project.mkdir()
@@ -109,7 +102,7 @@ def test_a_daemon_ends_with_the_run(tmp_path: Path, marks: Path, backend: str, e
             running.signal(number)
         running.finish()
         # The guardian of a launcher that was killed gives nodes 4.5 s, and kills what is left.
-        _wait_until(lambda: not _daemons(marks), 6.0 if number == signal.SIGKILL else 0.0)
+        wait_until(lambda: not _daemons(marks), 6.0 if number == signal.SIGKILL else 0.0)
 
 
 def test_a_daemon_of_a_script_ends_with_the_run(tmp_path: Path, marks: Path) -> None:

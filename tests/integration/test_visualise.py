@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from deadlines import wait_until
+from processes import is_alive
 from virtual_display import virtual_display
 
 pytest.importorskip("matplotlib")
@@ -237,7 +238,7 @@ while True:
         first = picture.stat().st_mtime_ns
         wait_until(lambda: picture.stat().st_mtime_ns > first)
         node.kill()
-    wait_until(lambda: not Path(f"/proc/{pid}").exists() or _is_zombie(pid))
+    wait_until(lambda: not is_alive(pid))
     assert picture.stat().st_size > 1000
 
 
@@ -262,10 +263,6 @@ def test_without_a_toolkit_or_a_display_the_figure_says_that_there_is_no_window(
     monkeypatch.setenv("NEUROS_GUI", "1")
     VisualiseLines("speed").close()
     assert "NEUROS_GUI is set, but there is no display" in capfd.readouterr().err
-
-
-def _is_zombie(pid: int) -> bool:
-    return ") Z " in Path(f"/proc/{pid}/stat").read_text()
 
 
 def test_plotting_a_point_needs_no_matplotlib_in_the_node(tmp_path: Path) -> None:

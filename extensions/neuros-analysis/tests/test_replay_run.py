@@ -15,6 +15,7 @@ import pytest
 from commands import neuros
 from deadlines import wait_until
 from launching import BACKENDS, EXAMPLES, launch, start
+from processes import is_alive, processes_of
 from recordings import flushed
 from replaying import MIXER, Recorded, copied, node, record, replay, wire, write_project
 
@@ -363,12 +364,13 @@ def test_a_run_that_was_killed_is_replayed_as_far_as_it_was_kept(what: str, tmp_
         assert refused.returncode == 4, refused.stdout + refused.stderr
         assert "is still being recorded: wait for its end" in refused.stderr
         wait_until(lambda: is_kept(run), DEADLINE_S)
+        processes = processes_of(run)
         if what == "everything":
-            for process in processes_of(run):
+            for process in processes:
                 os.kill(process, signal.SIGKILL)
         running.signal(signal.SIGKILL)
     # Nodes end by themselves without a launcher.
-    wait_until(lambda: not processes_of(run), DEADLINE_S)
+    wait_until(lambda: not any(map(is_alive, processes)), DEADLINE_S)
     done = neuros("replay", run)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "note: the launcher of the run was killed" in done.stdout
@@ -388,20 +390,6 @@ def is_kept(run: Path) -> bool:
     return len(packets) == 4 and min(packets) > 20 and min(logs) > 4096
 
 
-def processes_of(run: Path) -> list[int]:
-    """The processes that have the run folder in their command."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdigit() and int(entry.name) != os.getpid():
-            try:
-                command = (entry / "cmdline").read_bytes()
-            except OSError:
-                continue
-            if str(run).encode() in command:
-                found.append(int(entry.name))
-    return found
-
-
 def test_ctrl_c_ends_the_replays(own: Recorded, tmp_path: Path) -> None:
     waits = "    open(node.run_dir / 'waits', 'w').close()\n    import time\n    time.sleep(1000)\n"
     text = "    seen = node.get_user_data()\n"
@@ -412,4 +400,4 @@ def test_ctrl_c_ends_the_replays(own: Recorded, tmp_path: Path) -> None:
         wait_until((kept / "mixer/waits").exists, DEADLINE_S)
         process.send_signal(signal.SIGINT)
         assert process.wait(DEADLINE_S) == 130
-    assert processes_of(kept) == []
+    assert processes_of(kept) == {}
