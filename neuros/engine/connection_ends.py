@@ -79,8 +79,8 @@ class SendWindow:
     @property
     def is_tight(self) -> bool:
         """Whether it is blocked, or could be after one more packet of each hook."""
-        outstanding = self.outstanding
-        return 0 < outstanding > self.size - max(1, len(self.hooks))
+        outstanding = self.sent - self.acknowledged
+        return self.is_reliable and 0 < outstanding > self.size - (len(self.hooks) or 1)
 
     def spend(self, now_ns: int) -> None:
         """Count a sent packet."""

@@ -200,12 +200,21 @@ class Horizon:
         self._unanswered: dict[int, deque[int]] = {c + 1: deque() for c in self._outward}
         self._answered = dict.fromkeys(self._unanswered, 0)
         self._inboxes: dict[int, Outbox] = {}
+        # As the last state has them, and the channels that have changed since.
+        self._outboxes = {c.number: Outbox(c, 0, (), ()) for c in outward}
+        self._changed = {*self._outward}
+        self._has_received = True
         self._states: dict[str, KnownState] = {}
+        self._near: dict[str, set[str]] = {}  # the nodes that have a connection with each
         self._own = KnownState(node, 0, Moment(), self._sources, (), {})
         # By neighbour, what it was told, and the first instant that the node has handled since.
         self._told: dict[str, dict[str, KnownState]] = {name: {} for name in self.neighbours}
         self._since_ns: dict[str, int] = {}
         self._first: dict[str, tuple[int, str]] = {}
+        self._is_crowded = False  # whether a queue of ``_unhandled`` may be too long
+        # No message comes before this time, but for acknowledgements on other channels than these.
+        self._nothing_before_ns = 0
+        self._awaited: set[int] = set()
         # By neighbour, how many of its last messages brought packets, without another in between.
         self._with_packets = dict.fromkeys(self.neighbours, 0)
         self.rounds = 0
@@ -219,6 +228,7 @@ class Horizon:
         """Time 0 of the run has come, or a pause ends: now, in all nodes."""
         self.rounds += 1
         self._let_go_ns = time_ns
+        self._nothing_before_ns = 0
         self.handle(time_ns)
 
     def handle(self, time_ns: int) -> None:
@@ -230,13 +240,18 @@ class Horizon:
     def send(self, channel: int, arrival_ns: int, position: int = 0) -> None:
         """Count a message that the node sends."""
         self._sent[channel] += 1
+        self._changed.add(channel)
         self._under_way[channel].append((arrival_ns, position))
-        self._unhandled[channel].append(arrival_ns)
+        unhandled = self._unhandled[channel]
+        unhandled.append(arrival_ns)
+        self._is_crowded |= len(unhandled) > _MOST_UNHANDLED
+        self._nothing_before_ns = min(self._nothing_before_ns, arrival_ns)  # nor is its answer
         if channel + 1 in self._inward:
             self._unanswered[channel + 1].append(arrival_ns)
 
     def receive(self, channel: int) -> int:
         """Count a message that has come, in the order of the channel; returns its number."""
+        self._has_received = True
         number = self._received[channel] = self._received[channel] + 1
         return number
 
@@ -258,9 +273,11 @@ class Horizon:
             if state.node == self.node or (known is not None and known.version >= state.version):
                 continue
             self._states[state.node] = state
-            for name, channel in self._outward.items():
+            if known is None:
+                self._near[state.node] = state.near
+            for number, channel in self._outward.items():
                 if channel.target == state.node:
-                    self._forget(name, state)
+                    self._forget(number, state)
             for outbox in state.outboxes:
                 number, target, _, window = outbox.channel
                 if target == self.node:
@@ -276,22 +293,28 @@ class Horizon:
 
     def state(self, moment: Moment) -> KnownState:
         """The state of the node now; it has a new version if anything has changed."""
-        outboxes = tuple(
-            Outbox(
+        own = self._own
+        if not self._changed and not self._has_received and moment == own.moment:
+            return own
+        for number in self._changed:
+            under_way, channel = self._under_way[number], self._outward[number]
+            arrivals_ns, positions = zip(*under_way, strict=True) if under_way else ((), ())
+            self._outboxes[number] = Outbox(
                 channel,
                 self._sent[number] - len(under_way),
-                tuple(arrival_ns for arrival_ns, _ in under_way),
-                tuple(position for _, position in under_way) if channel.window else (),
+                arrivals_ns,
+                positions if channel.window else (),
             )
-            for (number, channel), under_way in zip(
-                self._outward.items(), self._under_way.values(), strict=True
-            )
+        self._own = KnownState(
+            self.node,
+            own.version + 1,
+            moment,
+            self._sources,
+            tuple(self._outboxes.values()) if self._changed else own.outboxes,
+            self._received.copy() if self._has_received else own.received,
         )
-        _, version, *old = self._own
-        if [moment, self._sources, outboxes, self._received] != old:
-            self._own = KnownState(
-                self.node, version + 1, moment, self._sources, outboxes, dict(self._received)
-            )
+        self._changed.clear()
+        self._has_received = False
         return self._own
 
     def news(
@@ -304,22 +327,18 @@ class Horizon:
             is_patient: whether the node, if it waits, asks only those that tell nothing unasked.
         """
         own = self.state(moment)
-        pauses = [(s.node, s.moment.waits_ns, s.moment.causes) for s in self._states.values()]
-        if moment.free_ns > moment.now_ns:
-            pauses += [(s.node, self._pending_ns(s), (self.node,)) for s in self._states.values()]
         self.withholds = False
         for name in self.neighbours:
             told = self._told[name]
-            # Another neighbour that waits is told itself.
-            waiting = [(t, c) for node, t, c in pauses if node == name or node not in self._told]
             trust = self._with_packets[name] >= _TRUSTED if is_patient else False
             others = [state for node, state in self._states.items() if node != name]
             new = [
                 state
                 for state in (own, *others)
-                if told.get(state.node) is not state and (state is own or name not in state.near)
+                if told.get(state.node) is not state
+                and (state is own or name not in self._near[state.node])
             ]
-            if new and (is_all or any(self._concerns(name, each, waiting, trust) for each in new)):
+            if new and (is_all or any(self._concerns(name, each, trust) for each in new)):
                 told.update((state.node, state) for state in (own, *others))
                 self._since_ns.pop(name, None)
                 if moment.free_ns >= 0:  # what they are told lasts until the end of the hook
@@ -333,13 +352,23 @@ class Horizon:
         Args:
             awaited: channels of acknowledgements that could change what it does.
         """
-        for number, queue in self._unhandled.items():
-            if len(queue) > _MOST_UNHANDLED and queue[_MOST_UNHANDLED] < time_ns:
-                self.causes = [self._outward[number].target]
-                return self._outward[number].target
+        if self._is_crowded:
+            self._is_crowded = False
+            for number, queue in self._unhandled.items():
+                if len(queue) > _MOST_UNHANDLED:
+                    self._is_crowded = True
+                    if queue[_MOST_UNHANDLED] < time_ns:
+                        self.causes = [self._outward[number].target]
+                        return self._outward[number].target
+        # What has been learnt since can only make arrivals later, and so the sum is not done again.
+        if time_ns < self._nothing_before_ns and self._awaited.issuperset(awaited):
+            self.causes = ()
+            return ""
         arrivals = [*self._arrivals(awaited)]
         for name, (first_ns, cause) in self._first.items():
             arrivals.append((min(first_ns, NEVER_NS - END_NS) + END_NS, name, cause))
+        self._awaited = {*awaited}
+        self._nothing_before_ns = min((each[0] for each in arrivals), default=NEVER_NS)
         early = [each for each in arrivals if each[0] <= time_ns]
         self.causes = sorted({cause for _, _, cause in early})
         return min(early)[1] if early else ""
@@ -380,6 +409,11 @@ class Horizon:
         return any(state.moment.rounds > self.rounds for state in self._states.values())
 
     @property
+    def has_sent(self) -> bool:
+        """Whether the node has sent messages since its last state."""
+        return bool(self._changed)
+
+    @property
     def is_under_way(self) -> bool:
         """Whether a message has been sent of which no neighbour has told yet that it has come."""
         return any(self._under_way.values())
@@ -407,6 +441,7 @@ class Horizon:
         under_way, unhandled = self._under_way[number], self._unhandled[number]
         left = self._sent[number] - state.received.get(number, 0)
         while len(under_way) > left:
+            self._changed.add(number)
             under_way.popleft()
         while len(unhandled) > left and unhandled[0] < state.moment.now_ns:
             unhandled.popleft()
@@ -424,7 +459,6 @@ class Horizon:
         self,
         name: str,
         state: KnownState,
-        waiting: Sequence[tuple[int, Sequence[str]]],
         trust: bool,
     ) -> bool:
         """Whether a neighbour, or a node behind it, may wait for a new state of a node."""
@@ -432,7 +466,7 @@ class Horizon:
         if old is None or state.moment.zero_ns < 0:
             return True
         before, now = old.moment, state.moment
-        since_ns = before.since_ns
+        since_ns, holds = before.since_ns, now.free_ns > now.now_ns
         if before.rounds < now.rounds:
             return True
         if state is self._own:
@@ -449,23 +483,34 @@ class Horizon:
                 self.withholds = True
         if now.now_ns - before.now_ns >= _LAG_NS:
             return True
-        return any(since_ns <= time_ns and state.node in causes for time_ns, causes in waiting)
+        for other in self._states.values():
+            # Another neighbour that waits is told itself.
+            if other.node == name or other.node not in self._told:
+                waits_ns, causes = other.moment.waits_ns, other.moment.causes
+                if since_ns <= waits_ns and state.node in causes:
+                    return True
+                if holds and state is self._own and since_ns <= self._pending_ns(other):
+                    return True
+        return False
 
     def _has_sent(self, name: str, old: KnownState) -> bool:
         """Whether there are messages that a neighbour must know of, or confirm."""
-        awaited = self._states[name].moment.awaited if name in self._states else ()
-        for outbox, before in zip(self._own.outboxes, old.outboxes, strict=True):
-            (number, target, _, window), sent = outbox.channel, outbox.sent - before.sent
-            if target == name and sent:
-                if not window or number in awaited or self._own.moment.ending is not None:
+        own = self._own
+        if own.outboxes is not old.outboxes:
+            awaited = self._states[name].moment.awaited if name in self._states else ()
+            for outbox, before in zip(own.outboxes, old.outboxes, strict=True):
+                number, target, _, window = outbox.channel
+                if target == name and outbox is not before and (sent := outbox.sent - before.sent):
+                    if not window or number in awaited or own.moment.ending is not None:
+                        return True
+                    if 2 * sent >= window:
+                        return True
+        if own.received is not old.received:
+            for number, source in self._inward.items():
+                unconfirmed = own.received[number] - old.received[number]
+                if unconfirmed >= _MOST_UNCONFIRMED and source == name:
                     return True
-                if 2 * sent >= window:
-                    return True
-        return any(
-            count - old.received[number] >= _MOST_UNCONFIRMED
-            for number, count in self._own.received.items()
-            if self._inward[number] == name
-        )
+        return False
 
     def _arrivals(self, awaited: Sequence[int]) -> Iterable[tuple[int, str, str]]:
         """The earliest times of messages to the node.

@@ -158,10 +158,12 @@ class NodeTime:
     @property
     def next_ns(self) -> int | None:
         """The time of the next event of the node, not before its own time; ``None``: never."""
-        times = [due for next_due_ns, _ in self._timers if (due := next_due_ns()) is not None]
-        if self._events:
-            times.append(self._events[0][0])
-        return max(self.now_ns, min(times)) if times else None
+        first_ns = self._events[0][0] if self._events else None
+        for next_due_ns, _ in self._timers:
+            due_ns = next_due_ns()
+            if due_ns is not None and (first_ns is None or due_ns < first_ns):
+                first_ns = due_ns
+        return self.now_ns if first_ns is not None and first_ns < self.now_ns else first_ns
 
     def step(self, time_ns: int) -> None:
         """Handle the events of an instant, until a hook takes time."""

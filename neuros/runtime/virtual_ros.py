@@ -22,6 +22,7 @@ from typing import Any
 import msgspec
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.timer import Timer
 from std_msgs.msg import UInt8MultiArray
 
 from neuros.engine.horizon import (
@@ -65,7 +66,7 @@ _STATED = struct.Struct("<2s2sI")
 _ALIGNMENT = 8
 """Of the packet behind the states, in bytes."""
 
-_PATIENCE_NS = 2_000_000
+_PATIENCE_S = 0.002
 """How long a node waits before it asks a neighbour that sends much, by the clock of the machine."""
 
 _ALL = QoSProfile(
@@ -95,7 +96,8 @@ class RosNodeTime(NodeTime):
         return self._loop.why_waiting
 
     def announce(self, duration_ns: int) -> None:
-        self._loop.tell(self.now_ns + duration_ns)
+        if duration_ns or self._loop.horizon.has_sent:
+            self._loop.tell(self.now_ns + duration_ns)
 
     def watch(self, awaited: Callable[[], Sequence[Connection]]) -> None:
         self._loop.awaited = awaited
@@ -140,6 +142,7 @@ class RosVirtualLoop(VirtualLoop):
         awaited: connections whose acknowledgements could change which hooks start.
         is_ready: whether the node has run its initialise hooks.
         why_waiting: which node keeps this one from its next event; empty if none does.
+        patience: calls :meth:`lose_patience`, once it is reset.
     """
 
     def __init__(self, seed: str, ros: RosLoop) -> None:
@@ -158,8 +161,8 @@ class RosVirtualLoop(VirtualLoop):
         # By neighbour, packets that leave with the next states.
         self._leaving: dict[str, list[tuple[VirtualSendingLink, bytes]]] = {}
         self._waits_ns = -1
-        self._patience: tuple[int, int] | None = None  # when it is over, and for which event
-        ros.add_timer(self._patience_ends_ns, self._lose_patience)
+        self.patience: Timer
+        self._is_patient_for: int | None = None  # the time of the event that it waits for
         self._at_zero: Event | None = None
         self._drain: Event | None = None  # what a node does when the end reaches it
         self._is_draining = self._is_stepped = False
@@ -270,8 +273,9 @@ class RosVirtualLoop(VirtualLoop):
             is_patient: whether to ask only neighbours that tell nothing unasked.
         """
         self._publish(self.horizon.news(self._moment(free_ns), is_patient=is_patient))
-        if self.horizon.withholds and self._patience is None:
-            self._patience = time.monotonic_ns() + _PATIENCE_NS, self._waits_ns
+        if self.horizon.withholds and self._is_patient_for is None:
+            self._is_patient_for = self._waits_ns
+            self.patience.reset()
 
     def tell_all(self) -> None:
         """Tell the neighbours all that is new."""
@@ -287,13 +291,11 @@ class RosVirtualLoop(VirtualLoop):
             if last is None or not last[0].publish_with(last[1], encoded):
                 self.publish(name, encoded)
 
-    def _patience_ends_ns(self) -> int | None:
-        return None if self._patience is None else self._patience[0]
-
-    def _lose_patience(self) -> None:
-        if self._patience is not None:
-            is_same, self._patience = self._patience[1] == self._waits_ns, None
-            self.tell(is_patient=not is_same)
+    def lose_patience(self) -> None:
+        """Ask the neighbours that the node still waits for."""
+        self.patience.cancel()
+        is_same, self._is_patient_for = self._is_patient_for == self._waits_ns, None
+        self.tell(is_patient=not is_same)
 
     def find_awaited(self) -> Sequence[int]:
         """The channels of acknowledgements that could change what the node does."""
@@ -483,6 +485,9 @@ class RosVirtualTransport(RosTransport):
             )
         loop.publish = lambda other, states: _publish(publishers[other], states)
         ros.every(ros_node, _TELL_ALL_S, loop.tell_all)
+        # A timer of ROS: for one of the loop, the executor would be left and entered each time.
+        loop.patience = ros.every(ros_node, _PATIENCE_S, loop.lose_patience)
+        loop.patience.cancel()
 
     def _unwrapping(self, deliver: Callable[[bytes], None]) -> Callable[[bytes], None]:
         def receive(data: bytes) -> None:

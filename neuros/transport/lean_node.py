@@ -152,7 +152,7 @@ class LeanNode(RosNode):  # type: ignore[misc]
         """As in rclpy; a call that waits is an error in the thread of hooks."""
         if self.callbacks is None:
             return super().create_client(*arguments, **keywords)
-        self.callbacks.loop.expect_arrivals()
+        self.callbacks.expect_arrivals()
         client = super().create_client(*arguments, **keywords)
         self.callbacks.guard_client(client)
         return client
@@ -172,7 +172,7 @@ class LeanNode(RosNode):  # type: ignore[misc]
         """The callback of something that is being created, guarded if a plugin creates it."""
         if self.callbacks is None:
             return callback
-        self.callbacks.loop.expect_arrivals()
+        self.callbacks.expect_arrivals()
         return self.callbacks.wrapped(callback)
 
 
@@ -207,6 +207,9 @@ class PluginCallbacks:
         enter: called before each part of a callback that runs in one go.
         fail: is given a callback and what it has raised; no other is called from then on.
         thread: the loop runs hooks and callbacks in it; by default this one.
+
+    Attributes:
+        has_any: whether the plugin has created anything.
     """
 
     def __init__(
@@ -218,11 +221,16 @@ class PluginCallbacks:
         thread: int | None = None,
     ) -> None:
         self.loop = loop
-        self.is_closed = False
+        self.is_closed = self.has_any = False
         self._enter = enter
         self._fail = fail
         self._thread = threading.get_ident() if thread is None else thread
         ros_node.callbacks = self
+
+    def expect_arrivals(self) -> None:
+        """The plugin creates something, which ROS will call."""
+        self.has_any = True
+        self.loop.expect_arrivals()
 
     def close(self) -> None:
         """Call none of them any more: the node has ended."""

@@ -132,8 +132,12 @@ class RosProcess:
         self._callbacks.append(PluginCallbacks(ros_node, self.ros_loop, enter, fail, thread))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
-        own = self._own_entities.get(file.node.name, set())
-        return self.has_node(file) and not entities(self.ros_node(file)) <= own
+        if not self.has_node(file):
+            return False
+        ros_node = self.ros_node(file)
+        if ros_node.callbacks is None or not ros_node.callbacks.has_any:
+            return False
+        return not entities(ros_node) <= self._own_entities[file.node.name]
 
     def join_peers(
         self,
