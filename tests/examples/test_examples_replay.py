@@ -31,11 +31,9 @@ LONG = [
     (f"{WHISKEYE}/tick_100ms.json", *SHORT),
     (f"{WHISKEYE}/homing.json", *SHORT),
     (f"{WHISKEYE}/live.json", *SHORT),
-    (f"{WHISKEYE}/nengo.json", *SHORT),
     (f"{WHISKEYE}/own_labels.json", *SHORT),
     (f"{WHISKEYE}/training.json", *SHORT),
     ("4_neurorobotics/light", "--duration", "5"),
-    ("4_neurorobotics/light/pynn.json", "--duration", "5"),
     ("6_outside/rover", "--duration", "2"),
     ("7_learning/cartpole", *SHORT),
     ("7_learning/cartpole/exported.json", *SHORT),
@@ -75,7 +73,11 @@ FORKED = [
     ("9_legs/ant", "1", *VIRTUAL_TIME, *SHORT),
 ]
 WITH_WEIGHTS = ["learning", "prediction", "prediction_asynchronous", "prediction_hybrid"]
-OWN_PYTHONS = ("5_containers/conflict", "--duration", "5")
+OWN_PYTHONS = [
+    (f"{WHISKEYE}/nengo.json", *SHORT),
+    ("4_neurorobotics/light/pynn.json", "--duration", "5"),
+    ("5_containers/conflict", "--duration", "5"),
+]
 
 
 def replays(options: tuple[str, ...], backend: str, folder: Path) -> None:
@@ -150,5 +152,8 @@ def printed(*arguments: object) -> str:
 
 
 @pytest.mark.acceptance
-def test_an_example_whose_nodes_have_pythons_of_their_own_replays(tmp_path: Path) -> None:
-    replays(OWN_PYTHONS, "process", tmp_path)
+@pytest.mark.parametrize("options", OWN_PYTHONS, ids=lambda options: options[0])
+def test_an_example_whose_nodes_have_pythons_of_their_own_replays(
+    options: tuple[str, ...], tmp_path: Path
+) -> None:
+    replays(options, "process", tmp_path)
