@@ -211,10 +211,8 @@ class Horizon:
         self._told: dict[str, dict[str, KnownState]] = {name: {} for name in self.neighbours}
         self._since_ns: dict[str, int] = {}
         self._first: dict[str, tuple[int, str]] = {}
-        self._is_crowded = False  # whether a queue of ``_unhandled`` may be too long
         # No message comes before this time, but for acknowledgements on other channels than these.
-        self._nothing_before_ns = 0
-        self._awaited: set[int] = set()
+        self._nothing_before_ns, self._awaited = 0, set[int]()
         # By neighbour, how many of its last messages brought packets, without another in between.
         self._with_packets = dict.fromkeys(self.neighbours, 0)
         self.rounds = 0
@@ -242,10 +240,9 @@ class Horizon:
         self._sent[channel] += 1
         self._changed.add(channel)
         self._under_way[channel].append((arrival_ns, position))
-        unhandled = self._unhandled[channel]
-        unhandled.append(arrival_ns)
-        self._is_crowded |= len(unhandled) > _MOST_UNHANDLED
-        self._nothing_before_ns = min(self._nothing_before_ns, arrival_ns)  # nor is its answer
+        self._unhandled[channel].append(arrival_ns)
+        is_full = len(self._unhandled[channel]) > _MOST_UNHANDLED
+        self._nothing_before_ns = 0 if is_full else min(self._nothing_before_ns, arrival_ns)
         if channel + 1 in self._inward:
             self._unanswered[channel + 1].append(arrival_ns)
 
@@ -352,18 +349,14 @@ class Horizon:
         Args:
             awaited: channels of acknowledgements that could change what it does.
         """
-        if self._is_crowded:
-            self._is_crowded = False
-            for number, queue in self._unhandled.items():
-                if len(queue) > _MOST_UNHANDLED:
-                    self._is_crowded = True
-                    if queue[_MOST_UNHANDLED] < time_ns:
-                        self.causes = [self._outward[number].target]
-                        return self._outward[number].target
         # What has been learnt since can only make arrivals later, and so the sum is not done again.
         if time_ns < self._nothing_before_ns and self._awaited.issuperset(awaited):
             self.causes = ()
             return ""
+        for number, queue in self._unhandled.items():
+            if len(queue) > _MOST_UNHANDLED and queue[_MOST_UNHANDLED] < time_ns:
+                self.causes = [self._outward[number].target]
+                return self._outward[number].target
         arrivals = [*self._arrivals(awaited)]
         for name, (first_ns, cause) in self._first.items():
             arrivals.append((min(first_ns, NEVER_NS - END_NS) + END_NS, name, cause))
@@ -410,8 +403,13 @@ class Horizon:
 
     @property
     def has_sent(self) -> bool:
-        """Whether the node has sent messages since its last state."""
-        return bool(self._changed)
+        """Whether the node has sent packets, or awaited acknowledgements, since its last state."""
+        for number in self._changed:
+            _, target, _, window = self._outward[number]
+            state = self._states.get(target)
+            if not window or (state is not None and number in state.moment.awaited):
+                return True
+        return False
 
     @property
     def is_under_way(self) -> bool:
@@ -455,12 +453,7 @@ class Horizon:
         time_ns = min(times)
         return -1 if time_ns == NEVER_NS else max(time_ns, state.moment.since_ns)
 
-    def _concerns(
-        self,
-        name: str,
-        state: KnownState,
-        trust: bool,
-    ) -> bool:
+    def _concerns(self, name: str, state: KnownState, trust: bool) -> bool:
         """Whether a neighbour, or a node behind it, may wait for a new state of a node."""
         old = self._told[name].get(state.node)
         if old is None or state.moment.zero_ns < 0:
@@ -496,21 +489,19 @@ class Horizon:
     def _has_sent(self, name: str, old: KnownState) -> bool:
         """Whether there are messages that a neighbour must know of, or confirm."""
         own = self._own
-        if own.outboxes is not old.outboxes:
-            awaited = self._states[name].moment.awaited if name in self._states else ()
-            for outbox, before in zip(own.outboxes, old.outboxes, strict=True):
-                number, target, _, window = outbox.channel
-                if target == name and outbox is not before and (sent := outbox.sent - before.sent):
-                    if not window or number in awaited or own.moment.ending is not None:
-                        return True
-                    if 2 * sent >= window:
-                        return True
-        if own.received is not old.received:
-            for number, source in self._inward.items():
-                unconfirmed = own.received[number] - old.received[number]
-                if unconfirmed >= _MOST_UNCONFIRMED and source == name:
+        awaited = self._states[name].moment.awaited if name in self._states else ()
+        for outbox, before in zip(own.outboxes, old.outboxes, strict=True):
+            number, target, _, window = outbox.channel
+            if target == name and outbox is not before and (sent := outbox.sent - before.sent):
+                if not window or number in awaited or own.moment.ending is not None:
                     return True
-        return False
+                if 2 * sent >= window:
+                    return True
+        return own.received is not old.received and any(
+            count - old.received[number] >= _MOST_UNCONFIRMED
+            for number, count in own.received.items()
+            if self._inward[number] == name
+        )
 
     def _arrivals(self, awaited: Sequence[int]) -> Iterable[tuple[int, str, str]]:
         """The earliest times of messages to the node.

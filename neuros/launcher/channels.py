@@ -96,11 +96,6 @@ class Channels:
                 self.send_to(link, message)
 
     @property
-    def greeted(self) -> set[str]:
-        """The nodes whose processes have said hello."""
-        return {name for names in self._nodes.values() for name in names}
-
-    @property
     def process_count(self) -> int:
         return len(self._nodes)
 

@@ -154,7 +154,9 @@ class StallDetector:
     def is_held_up(self, name: str, now_s: float) -> bool:
         """Whether a node cannot take in packets, which is said otherwise: a hook executes in its
         process, or it does not report."""
-        return self._is_busy(name) or self._nodes[name].silent_s(now_s) >= SILENT_S
+        node = self._nodes[name]
+        is_busy = any(self._nodes[each].executing for each in node.together)
+        return is_busy or node.silent_s(now_s) >= SILENT_S
 
     def rested_s(self, now_s: float) -> float:
         """For how long no hook has run and no packet has arrived; 0 while one executes."""
@@ -319,10 +321,6 @@ class StallDetector:
 
     def _reports(self) -> list[tuple[str, Report]]:
         return [(name, node.report) for name, node in sorted(self._nodes.items()) if node.report]
-
-    def _is_busy(self, name: str) -> bool:
-        """Whether a hook executes in the process of a node."""
-        return any(self._nodes[each].executing for each in self._nodes[name].together)
 
     def _is_named(self, name: str) -> bool:
         """Whether the hook that a node was executing when it reported last has been named."""

@@ -95,7 +95,8 @@ class MuJoCoWorlds:
         # By what is read: the views of all copies, in turn, and whether mj_forward comes before.
         self._views: dict[tuple[str, ...], tuple[list[Any], bool, bool]] = {}
         self._times = np.zeros((self.copies, 1))
-        self._threads = max(1, threads if threads is not None else self._usual_threads())
+        usual_threads = min(len(os.sched_getaffinity(0)), self.copies // _COPIES_PER_THREAD)
+        self._threads = max(1, threads if threads is not None else usual_threads)
         self._pool: ThreadPoolExecutor | None = None
         self._view = WorldView(lambda: (self.models[0], self.data[0], self.sim_time))
         self.reset()
@@ -199,9 +200,6 @@ class MuJoCoWorlds:
             self._pool = None
 
     # ---- inside -----------------------------------------------------------------------------
-
-    def _usual_threads(self) -> int:
-        return min(len(os.sched_getaffinity(0)), self.copies // _COPIES_PER_THREAD)
 
     def _check_fields(self, variables: Mapping[str, str]) -> None:
         """Check the fields of the model that a fork will change. Raises ``ModelError``."""
