@@ -39,7 +39,7 @@ LONG = [
     ("7_learning/cartpole/exported.json", *SHORT),
     ("8_plasticity/gaze", "--set", "nodes.chair.environment.SECONDS=3"),
     ("8_plasticity/seeker", "--set", "nodes.teacher.environment.EPISODES=2"),
-    ("9_legs/ant", *SHORT),
+    ("9_legs/ant", "--duration", "3"),
 ]
 VIRTUAL_TIME = ("--time", "virtual")
 FORKED = [
@@ -70,7 +70,7 @@ FORKED = [
     ("7_learning/cartpole/exported.json", "1", *VIRTUAL_TIME, *SHORT),
     ("8_plasticity/gaze", "1", *VIRTUAL_TIME, "--set", "nodes.chair.environment.SECONDS=3"),
     ("8_plasticity/seeker", "1", *VIRTUAL_TIME, "--set", "nodes.teacher.environment.EPISODES=2"),
-    ("9_legs/ant", "1", *VIRTUAL_TIME, *SHORT),
+    ("9_legs/ant", "1", *VIRTUAL_TIME, "--duration", "3"),
 ]
 WITH_WEIGHTS = ["learning", "prediction", "prediction_asynchronous", "prediction_hybrid"]
 OWN_PYTHONS = [

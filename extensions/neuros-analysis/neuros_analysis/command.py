@@ -208,11 +208,21 @@ def add_sweep(command: argparse.ArgumentParser) -> None:
     command.set_defaults(command=_sweep)
 
 
-def _sweep(parsed: argparse.Namespace) -> int:
-    from neuros_analysis.sweep import CSV_NAME, sweep
+@contextlib.contextmanager
+def plain_warnings() -> Iterator[None]:
+    """While the block lasts, warnings of projects are written without a line of Python."""
 
     def warn(message: Warning | str, *_: Any, **__: Any) -> None:
-        print(f"warning: {message}", file=sys.stderr)  # without the line of Python
+        print(f"warning: {message}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("default", UserWarning)
+        warnings.showwarning = warn
+        yield
+
+
+def _sweep(parsed: argparse.Namespace) -> int:
+    from neuros_analysis.sweep import CSV_NAME, sweep
 
     def print_row(number: int, count: int, row: Mapping[str, Any]) -> None:
         values = list(row)[: list(row).index("exit_code")]
@@ -221,9 +231,7 @@ def _sweep(parsed: argparse.Namespace) -> int:
         print(f"[{number}/{count}] {what}: {row['reason']}", file=stream, flush=True)
 
     is_json = parsed.format == JSON
-    with warnings.catch_warnings():
-        warnings.simplefilter("default", UserWarning)
-        warnings.showwarning = warn
+    with plain_warnings():
         options = values_of(options_of(SweepOptions), parsed)
         made = sweep(parsed.project, **options, on_row=print_row)
     if is_json:

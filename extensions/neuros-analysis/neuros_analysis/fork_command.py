@@ -51,11 +51,12 @@ def add_fork(fork: argparse.ArgumentParser) -> None:
 
 def _fork(options: argparse.Namespace) -> int:
     from neuros.cli.environments import signals_interrupt
+    from neuros_analysis.command import plain_warnings
     from neuros_analysis.forking import fork_run, moment
 
     at_s, _ = moment(options.at)
     settings = _settings_of(options.set)
-    with signals_interrupt([]):
+    with signals_interrupt([]), plain_warnings():
         forked = fork_run(
             options.run.absolute(),
             options.at,

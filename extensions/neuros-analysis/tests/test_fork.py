@@ -94,6 +94,7 @@ def write_project(folder: Path, *, is_strict: bool = True) -> Path:
     robot |= {"outputs": [{"name": "angle", **number, **sensor}]}
     brain: dict[str, Any] = {"name": "brain", "container": "neuros_python", "plugin": "brain.py"}
     brain |= {"inputs": [{"name": "angle", **number}], "outputs": [{"name": "torque", **number}]}
+    brain["outputs"].append({"name": "spare", **number})
     brain |= {"environment": {"GAIN": 1}}
     wires = [("robot", "angle", "brain"), ("brain", "torque", "robot")]
     keys = ("source_node", "source_output", "destination_node", "destination_input")
@@ -284,7 +285,11 @@ def test_all_reasons_are_named_at_once(own: Path, tmp_path: Path) -> None:
     (own / "run.json").write_text(json.dumps(record))
     done = fork(own, tmp_path / "fork", "--at", "0.5sim")
     assert done.returncode == 2, done.stdout + done.stderr
-    assert done.stderr.splitlines() == [
+    project = tmp_path / "project/project.json"
+    warning, *lines = done.stderr.splitlines()
+    assert warning.startswith(f"warning: {project}:1:"), done.stderr
+    assert warning.endswith("output 'spare' of node 'brain' is not connected"), done.stderr
+    assert lines == [
         f"neuros: {own} cannot be forked:",
         "  brain, hook 'look': ticks by the wall clock: let it tick by simulated time"
         " (sim_seconds)",
