@@ -22,7 +22,7 @@ from neuros.hooks import neuros_function, neuros_initialise
 @neuros_initialise(outputs="ball")
 def serve(node):
     packet = node.make_packet("ball")
-    packet.data = int.from_bytes(os.urandom(4), "little") % 1000
+    packet.data = int.from_bytes(os.urandom(4), "little") // 2
     return packet
 @neuros_function(inputs="back")
 def catch(node, back):
