@@ -42,7 +42,8 @@ HEARS = """
 from neuros.hooks import neuros_function
 @neuros_function(inputs="x")
 def hear(node, x):
-    pass
+    with (node.run_dir / "heard").open("a") as file:
+        file.write(x.data + "\\n")
 """
 
 
@@ -61,10 +62,11 @@ def project(folder: Path) -> Path:
 class Speaker:
     """Publishes all the time, and observes the run meanwhile."""
 
-    def __init__(self, program: RosProgram, live: LiveRun) -> None:
+    def __init__(self, program: RosProgram, live: LiveRun, heard: Path) -> None:
         self._publisher = program.node.create_publisher(message_class(STRING), "/said", 10)
         self._link = observing(live)
-        self.beats = self.heard = self.arrived = 0
+        self._heard = heard
+        self.beats = self.heard = self.arrived = self._said = 0
         self.is_paused = False
 
     def wish(self, message: Message) -> None:
@@ -78,13 +80,18 @@ class Speaker:
         deadline_s = time.monotonic() + LIMIT_S
         while not condition():
             assert time.monotonic() < deadline_s, f"not within {LIMIT_S:g} s"
-            self._publisher.publish(message_class(STRING)())
+            self._said += 1
+            self._publisher.publish(message_class(STRING)(data=str(self._said)))
             self._look()
 
     def speak_for(self, packets: int) -> None:
         """Publish, and look at the run, until so many more packets have arrived."""
         arrived = self.arrived + packets
         self.speak_until(lambda: self.arrived >= arrived)
+
+    def heard_since(self, count: int) -> list[int]:
+        """The numbers of the packets that its hook has taken after the first ``count``."""
+        return [int(line) for line in self._heard.read_text().split()[count:]]
 
     def _look(self) -> None:
         self._link.send(GetStatus({}))
@@ -118,7 +125,7 @@ def speaker(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Speaker]
             backend=request.param, domain_id=domain.id, output=tmp_path / "run"
         ) as live,
     ):
-        speaker = Speaker(program, live)
+        speaker = Speaker(program, live, tmp_path / "run/ear/heard")
         yield speaker
         speaker.close()
 
@@ -138,8 +145,12 @@ def test_a_step_takes_what_had_come_before_it_and_then_the_run_is_paused_again(
             lambda beats=beats, heard=heard: speaker.beats > beats and speaker.heard > heard
         )
         speaker.speak_for(20)  # by then it has taken each packet of the step
+        assert speaker.beats == beats + 1
         # Its queue holds ten; one that comes while they are taken drives the oldest out.
-        assert (speaker.beats, heard < speaker.heard <= heard + 10) == (beats + 1, True)
+        taken = speaker.heard_since(heard)
+        assert len(taken) == speaker.heard - heard
+        assert 0 < len(taken) <= 10
+        assert taken == [*range(taken[0], taken[0] + len(taken))]
     beats, heard = speaker.beats, speaker.heard
     speaker.speak_for(20)
     assert (speaker.beats, speaker.heard) == (beats, heard)
