@@ -404,12 +404,8 @@ class Horizon:
     @property
     def has_sent(self) -> bool:
         """Whether the node has sent packets, or awaited acknowledgements, since its last state."""
-        for number in self._changed:
-            _, target, _, window = self._outward[number]
-            state = self._states.get(target)
-            if not window or (state is not None and number in state.moment.awaited):
-                return True
-        return False
+        awaited = {number for s in self._states.values() for number in s.moment.awaited}
+        return any(not self._outward[n].window or n in awaited for n in self._changed)
 
     @property
     def is_under_way(self) -> bool:

@@ -369,14 +369,6 @@ def _not_for_plugins(name: str) -> NodeError:
     return NodeError(f"{name}: {NO_WAITING}")
 
 
-def entities(ros_node: RosNode) -> set[int]:
-    """Marks of the subscriptions, timers, services, clients and waitables of a ROS node."""
-    groups = (ros_node.subscriptions, ros_node.timers, ros_node.services, ros_node.clients)
-    return {id(entity) for group in groups for entity in group} | {
-        id(waitable) for waitable in ros_node.waitables
-    }
-
-
 def give_up(context: Context, ros_nodes: Iterable[RosNode]) -> None:
     """Destroy all nodes of a context, and shut it down."""
     ros_nodes = list(ros_nodes)

@@ -31,7 +31,6 @@ from neuros.transport.lean_node import (
     Fail,
     LeanNode,
     PluginCallbacks,
-    entities,
     give_up,
     lean_node,
 )
@@ -87,7 +86,6 @@ class RosProcess:
         self.loop: EventLoop = self.ros_loop
         self.packets = RosPackets()
         self._ros_nodes: dict[str, LeanNode] = {}
-        self._own_entities: dict[str, set[int]] = {}
         self._callbacks: list[PluginCallbacks] = []
         self._transports: list[Transport] = []
 
@@ -128,16 +126,11 @@ class RosProcess:
         ``thread`` runs the hooks; by default this one.
         """
         ros_node = self.ros_node(file)
-        self._own_entities[file.node.name] = entities(ros_node)
         self._callbacks.append(PluginCallbacks(ros_node, self.ros_loop, enter, fail, thread))
 
     def has_foreign_entities(self, file: NodeFile) -> bool:
-        if not self.has_node(file):
-            return False
-        ros_node = self.ros_node(file)
-        if ros_node.callbacks is None or not ros_node.callbacks.has_any:
-            return False
-        return not entities(ros_node) <= self._own_entities[file.node.name]
+        callbacks = self.ros_node(file).callbacks if self.has_node(file) else None
+        return callbacks is not None and callbacks.has_any
 
     def join_peers(
         self,
